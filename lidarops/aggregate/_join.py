@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import UNSHARED, Header, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
+from lidarops.netcdf.coordinates import on_altitude
 from lidarops.netcdf.read import as_variable
 from lidarops.netcdf.stored import StoredProduct, stored_values
 from lidarops.netcdf.variables import attributes
@@ -65,8 +66,8 @@ def pattern_of(product: StoredProduct, header: Header) -> xr.Dataset:
     -------
     xr.Dataset
         Not decoded, in memory, with ``product`` (product,) and ``product_index`` (time,).
-        Variables of the whole product have the dimension ``product``. Only coordinates that do not
-        change with time have values.
+        Variables of the whole product have the dimension ``product``; those of a vertical lidar
+        lie along altitude. Only coordinates that do not change with time have values.
     """
     static = coordinate_names(header.kind)
     variables: dict[Any, xr.Variable] = {}
@@ -88,7 +89,7 @@ def pattern_of(product: StoredProduct, header: Header) -> xr.Dataset:
         PRODUCT.name: (PRODUCT.dims, np.array([header.id]), about[PRODUCT.name]),
         PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
     }
-    return xr.Dataset(variables, coords=own, attrs=product.attrs.whole())
+    return xr.Dataset(on_altitude(variables), coords=own, attrs=product.attrs.whole())
 
 
 def join(parts: Sequence[Part], pattern: xr.Dataset) -> xr.Dataset:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -22,9 +22,8 @@ from lidarops.kinds import kinds
 from lidarops.netcdf.stored import (
     StoredProduct,
     changed,
-    opened_stored,
+    open_stored,
     reading,
-    stored_product,
 )
 from lidarops.netcdf.stored_flags import FlagCounter, all_bits, flags_names, rejecting_mask
 from lidarops.netcdf.variables import PROVENANCE, RECORDERS, layout_of
@@ -191,9 +190,8 @@ class Header:
             If it cannot be read, or is another product now.
         """
         file = within(root, self.path)
-        with ExitStack() as until_closed:
+        with open_stored(file) as product:
             with reading(file):
-                product = until_closed.enter_context(stored_product(file))
                 if product.attrs.get("id") != self.id:
                     raise changed(self.path)
             yield product
@@ -294,7 +292,7 @@ def read_product_facts(
     """
     try:
         file = within(root, path)
-        with opened_stored(file) as product:
+        with reading(file), open_stored(file) as product:
             header = read_header(product, path, selection)
             return None if header is None else _facts(product, file, header)
     except ProductError as error:
@@ -387,7 +385,7 @@ def _grid_digest(product: StoredProduct, kind: str) -> str:
         if name in UNSHARED:
             continue
         dims = variable.dims
-        sizes = [(dim, n) for dim, n in variable.sizes.items() if dim != "time"]
+        sizes = [each for each in zip(dims, variable.shape, strict=True) if each[0] != "time"]
         schema = [plain(variable.attrs.get(key)) for key in _SCHEMA_ATTRIBUTES]
         digest.update(repr((name, variable.dtype.str, dims, sizes, schema)).encode())
         if name in coordinates and "time" not in dims:

@@ -39,7 +39,7 @@ from lidarops.netcdf.context import (
     prov_document,
     prov_type,
 )
-from lidarops.netcdf.coordinates import auxiliary_names
+from lidarops.netcdf.coordinates import auxiliary_names, on_altitude
 from lidarops.netcdf.encoding import as_stored, as_text
 from lidarops.netcdf.read import as_variable
 from lidarops.netcdf.stored import StoredProduct, reading
@@ -315,7 +315,7 @@ def _encoded(frame: Mapping[str, xr.Variable], year: _Year) -> xr.Dataset:
         "station": frame["station"],
         rows.PROVENANCE.name: as_text(rows.PROVENANCE, _provenance(year), mode),
     }
-    dataset = xr.Dataset(variables, attrs=_global_attributes(table, year))
+    dataset = xr.Dataset(on_altitude(variables), attrs=_global_attributes(table, year))
     dataset.encoding["unlimited_dims"] = {"time"}
     return dataset
 

@@ -8,7 +8,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import xarray as xr
 
 from lidarops.aggregate._join import Part, join, pattern_of
@@ -25,7 +24,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.netcdf.stored import opened_stored, reading
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.system.files import within
 
@@ -44,7 +43,6 @@ def open_products(
     since: datetime | str | None = None,
     until: datetime | str | None = None,
     usable: int = CARE,
-    on_altitude: bool = False,
     version: str | None = None,
 ) -> xr.Dataset:
     """Open products of one instrument, kind, channel and grid as one dataset in order of time.
@@ -63,9 +61,6 @@ def open_products(
     usable : int
         Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN. Each
         quantity is masked by the flags that judge it; flags and ``usable`` are not masked.
-    on_altitude : bool
-        Whether the dimension ``range`` becomes ``altitude``, m above the geoid, so that values can
-        be selected by it. Beams must go up and not move, as those of vertical lidars.
     version : str, optional
         Id of a snapshot of a store; without it the newest.
 
@@ -74,6 +69,8 @@ def open_products(
     xarray.Dataset
         Decoded, with units as attributes, on dask arrays, with one chunk per product unless it is
         of a store.
+        Those of vertical lidars have the dimension ``altitude``, m above the geoid, of slant beams
+        ``range``.
         ``product`` (product) is the id of each product, ``product_index`` (time) the index of the
         product of each profile. Variables of a whole product, such as the assumed lidar ratio,
         have the dimension ``product``.
@@ -85,8 +82,7 @@ def open_products(
         no product is found; if the products cannot be joined (the message lists instruments,
         kinds, channels and grids to choose from).
     RetrievalInputError
-        If `usable`, `kind` or a time is invalid, `version` is given without a store, or beams are
-        not as `on_altitude` needs them.
+        If `usable`, `kind` or a time is invalid, or `version` is given without a store.
 
     Examples
     --------
@@ -96,9 +92,7 @@ def open_products(
     selection = parse_selection(kind, channel, station, instrument, since, until)
     store = Path(source) if isinstance(source, str | os.PathLike) else None
     if store is not None and is_store(store):
-        return _usable_values(
-            open_store(store, selection, version), usable, on_altitude=on_altitude
-        )
+        return _usable_values(open_store(store, selection, version), usable)
     if version is not None:
         raise RetrievalInputError(
             "only stores have versions", field="version", remedy="give the folder of a store"
@@ -116,7 +110,7 @@ def open_products(
     with headers[0].opened(root) as product, reading(headers[0].path):
         pattern = pattern_of(product, headers[0])
     # Decoded once, which is much faster than decoding each product.
-    return _usable_values(xr.decode_cf(join(ordered, pattern)), usable, on_altitude=on_altitude)
+    return _usable_values(xr.decode_cf(join(ordered, pattern)), usable)
 
 
 def _remedy(folder: Path | None) -> str:
@@ -149,7 +143,7 @@ def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict
     for path in paths:
         try:
             file = within(root, path)
-            with opened_stored(file) as product:
+            with reading(file), open_stored(file) as product:
                 header = read_header(product, path, selection)
                 if header is not None:
                     parts[header] = Part(header, file, product.attrs.whole(), product["time"][...])
@@ -158,22 +152,7 @@ def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict
     return parts
 
 
-def _usable_values(data: xr.Dataset, worst: int, *, on_altitude: bool) -> xr.Dataset:
-    """Return data without worse values; with `on_altitude`, on altitudes instead of ranges."""
-    masked = _masked(data, worst)
-    if not on_altitude:
-        return masked
-    altitude = masked.get("altitude")
-    if altitude is None or altitude.dims != ("range",) or not (np.diff(altitude) > 0.0).all():
-        raise RetrievalInputError(
-            "beams are level or move, so that a range has no altitude of its own",
-            field="on_altitude",
-            remedy="select by range",
-        )
-    return masked.swap_dims(range="altitude")
-
-
-def _masked(data: xr.Dataset, worst: int) -> xr.Dataset:
+def _usable_values(data: xr.Dataset, worst: int) -> xr.Dataset:
     """Return data without the floating-point values that their flags call worse than `worst`."""
     if worst not in (0, CARE, ALL):
         raise RetrievalInputError(

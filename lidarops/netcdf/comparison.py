@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
-from lidarops.netcdf.read import opened_product, read_provenance
+from lidarops.netcdf.read import open_product, read_provenance
+from lidarops.netcdf.stored import reading
 from lidarops.netcdf.stored_flags import flags_names, parts
 from lidarops.netcdf.variables import PROVENANCE, judging, summary_of
 from lidarops.records import Change, Grade, Measure, Plan
@@ -96,14 +97,14 @@ def compare_products(old: Path, new: Path) -> Change:
     then, now = _making(old), _making(new)
     causes = [cause for what in then for cause in _changes(what, then[what], now[what])]
     try:
-        with _opened(old) as before, _opened(new) as after:
+        with reading(new), _opened(old) as before, _opened(new) as after:
             _refuse_another(before, after, new)
             differences = [d for d in _differences(before, after) if d.count or d.lost or d.moved]
             same_texts = _texts(before) == _texts(after)
             sizes = {name: part[name].size for part in (before, after) for name in _measured(part)}
     except ProductError:
         # It names the new one, also where values of the old one cannot be read.
-        with _opened(old) as before:
+        with reading(old), _opened(old) as before:
             for variable in before.variables.values():
                 for part in parts(variable, _BLOCK):
                     _ = variable[part].values
@@ -151,7 +152,7 @@ def quantity_changes(old: Path, new: Path) -> list[QuantityChange]:
         If a file cannot be read.
     """
     found = []
-    with _opened(old) as before, _opened(new) as after:
+    with reading(new), _opened(old) as before, _opened(new) as after:
         names = [name for name in _measured(before) if f"{name}{_ERROR}" in before]
         for name in (name for name in names if name in after and "time" in before[name].dims):
             pair = before[name].variable, after[name].variable
@@ -173,7 +174,7 @@ def quantity_changes(old: Path, new: Path) -> list[QuantityChange]:
 
 def _opened(file: Path) -> AbstractContextManager[xr.Dataset]:
     """Open a product whose missing values are NaN, and are not decoded otherwise."""
-    return opened_product(file, in_parts=True, decode_times=False, decode_coords=False)
+    return open_product(file, decode_times=False)
 
 
 def _refuse_another(before: xr.Dataset, after: xr.Dataset, new: Path) -> None:

@@ -23,6 +23,11 @@ _SAME_STEP: Final = 1e-6
 _LEVEL: Final = 1e-6
 """m; vertical step of a level beam: cos(90 degrees) is 6e-17, and 1e-3 degree more gives 1e-4 m."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+_NAMES_IN: Final = (
+    ("coordinates", "altitude", "range"),
+    ("cell_methods", "range:", "altitude:"),
+)
+"""Attribute, and the name in it that another one takes the place of along altitude."""
 EQUATOR: Final = 6_378_137.0
 """m, semi-major axis of WGS 84."""
 _FLATTENING: Final = 1.0 / 298.257223563
@@ -117,6 +122,41 @@ def auxiliary_names(row: Row, coordinates: Mapping[str, xr.Variable]) -> tuple[s
         and set(coordinate.dims) <= set(row.dims)
         and name not in excluded
     )
+
+
+def on_altitude(variables: Mapping[str, xr.Variable]) -> dict[str, xr.Variable]:
+    """Return the variables of a product as they are written: of a vertical lidar along altitude.
+
+    ``altitude`` is then the dimension and its coordinate, so that any tool selects values by it,
+    and ``range`` an auxiliary coordinate. What reads products takes them back to ``range``
+    (`lidarops.netcdf.stored.StoredProduct`).
+
+    Parameters
+    ----------
+    variables : mapping of str to xr.Variable
+        All of the product; coordinates that do not change with time are in memory.
+
+    Returns
+    -------
+    dict of str to xr.Variable
+        Those of a beam that moves, or is more than `NEAR_VERTICAL` off the zenith, as they are.
+    """
+    zenith, altitude = (variables.get(name) for name in ("zenith_angle", "altitude"))
+    written = dict(variables)
+    if zenith is None or altitude is None or altitude.dims != ("range",):
+        return written
+    if zenith.values > NEAR_VERTICAL or (np.diff(altitude.values) <= 0.0).any():
+        return written
+    for name, variable in variables.items():
+        if "range" in variable.dims:
+            dims = ["altitude" if dim == "range" else dim for dim in variable.dims]
+            attrs = dict(variable.attrs)
+            for key, old, new in _NAMES_IN:
+                if key in attrs:
+                    words = (new if word == old else word for word in attrs[key].split())
+                    attrs[key] = " ".join(words)
+            written[name] = xr.Variable(dims, variable.data, attrs)
+    return written
 
 
 class _Vertical(NamedTuple):

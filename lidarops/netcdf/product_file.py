@@ -19,7 +19,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import Context, global_attributes, prov_json
-from lidarops.netcdf.coordinates import auxiliary_names, locate_product
+from lidarops.netcdf.coordinates import auxiliary_names, locate_product, on_altitude
 from lidarops.netcdf.encoding import (
     Values,
     as_text,
@@ -224,7 +224,7 @@ class ProductWriter:
             attrs["lidarops_steps"] = str(self._frame_texts["steps"])
         if self._frame_texts.get("references"):
             attrs["references"] = f"{attrs['references']}\n{self._frame_texts['references']}"
-        variables = dict(self._variables(encoded))
+        variables = on_altitude(dict(self._variables(encoded)))
         for row in self._layout.variables:
             missing = [name for name in row.ancillaries if name not in variables]
             if row.name in variables and missing:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
@@ -60,17 +60,15 @@ _OF_HDF5: Final = (
 
 
 @contextmanager
-def reading(
-    path: str | Path, families: tuple[type[Exception], ...] = _OF_LIBRARIES
-) -> Iterator[None]:
-    """Raise what a library raises for a damaged product, by default anything, as `ProductError`."""
+def reading(path: str | Path) -> Iterator[None]:
+    """Raise what a library raises for a damaged product as `ProductError`, which names the file."""
     try:
         yield
     except LidarOpsError:
         raise
     except NO_FILE as error:
         raise ProductError("the file is missing", file=path) from error
-    except families as error:
+    except _OF_LIBRARIES as error:
         words = " ".join(str(error).replace(str(path), Path(path).name).split())
         raise ProductError(
             f"cannot be read: {words[:_MOST_WORDS] or type(error).__name__}",
@@ -171,15 +169,18 @@ class StoredVariable:
         # A dimension without variable holds no values.
         self.is_bare = self.is_scale and h5ds.get_scale_name(stored).startswith(_NO_VARIABLE)
         values = 0 if self.is_bare else math.prod(self.shape)
-        self.stated = int(self._type.get_size() * max(values, math.prod(chunk)))
+        self.stated = self._type.get_size() * max(values, math.prod(chunk))
         """Bytes in memory; at least one chunk is read."""
         self.attrs = Attributes(stored)
         self.dims: tuple[str, ...] = ()
+        self.written: tuple[str, ...] = ()
+        """Its dimensions in the file, where ``altitude`` may stand for ``range``."""
 
     def lie_along(self, along: Mapping[tuple[int, int], str]) -> None:
         """Take its dimensions from those of a file; one without other dimensions is its own."""
         own = (f"{self._name}_{axis}" if axis else self._name for axis in range(len(self.shape)))
         self.dims = tuple(along.get((self._address, axis), name) for axis, name in enumerate(own))
+        self.written = self.dims
 
     def attached(self) -> Iterator[tuple[int, int]]:
         """Yield the address of each variable along this dimension, and which axis of it this is."""
@@ -200,19 +201,15 @@ class StoredVariable:
         stated: np.dtype[Any] = self._type.dtype
         return stated.newbyteorder("=")
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Length along each dimension."""
-        return dict(zip(self.dims, self.shape, strict=True))
-
     def __getitem__(self, key: Any) -> NDArray[Any]:
         """Return values as stored.
 
         Raises
         ------
         ProductError
-            If they cannot be read.
+            If they cannot be read, or would not fit into memory.
         """
+        self._refuse_more_than_fits(key)
         with reading(self._path):
             if self._type.get_class() == h5t.STRING and self._type.is_variable_str():
                 text = h5py.Dataset(self._stored).asstr(errors="replace")
@@ -224,6 +221,19 @@ class StoredVariable:
             self._stored.read(h5s.ALL, h5s.ALL, values)
             return values
 
+    def _refuse_more_than_fits(self, key: Any) -> None:
+        most = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if self.stated <= most:
+            return
+        keys = () if key is ... else key if isinstance(key, tuple) else (key,)
+        taken = (
+            len(range(size)[part]) if isinstance(part, slice) else np.size(part)
+            for size, part in zip(self.shape, keys, strict=False)
+        )
+        size = self._type.get_size() * math.prod((*taken, *self.shape[len(keys) :]))
+        if size > most:
+            raise _too_large(size, most, "be read on this machine", self._path, self._name)
+
 
 class StoredProduct:
     """An open NetCDF-4 file.
@@ -233,8 +243,6 @@ class StoredProduct:
     file : h5py.File
     path : path or str
         Its name, in messages.
-    in_parts : bool
-        As of `opened_stored`.
 
     Raises
     ------
@@ -242,12 +250,12 @@ class StoredProduct:
         If it states more than it can hold.
     """
 
-    def __init__(self, file: h5py.File, path: str | Path, *, in_parts: bool = False) -> None:
+    def __init__(self, file: h5py.File, path: str | Path) -> None:
         root = h5g.open(file.id, b"/")
         self.attrs = Attributes(root)
         """Global attributes."""
         stored = dict(_variables(root, path))
-        _refuse_large({name: one.stated for name, one in stored.items()}, path, in_parts=in_parts)
+        _refuse_bomb({name: one.stated for name, one in stored.items()}, path)
         scales = {name: one for name, one in stored.items() if one.is_scale}
         self.sizes = {name: one.shape[0] for name, one in scales.items()}
         """Length of each dimension."""
@@ -258,6 +266,12 @@ class StoredProduct:
             if not one.is_bare:
                 one.lie_along(along)
                 self.variables[name.removeprefix(OTHER_DIMENSION)] = one
+        # Named alike for vertical and slant beams, and in files without a dimension ``altitude``.
+        distance = self.variables.get("range")
+        if distance is not None and distance.dims == ("altitude",) and "range" not in self.sizes:
+            self.sizes = {"range" if d == "altitude" else d: n for d, n in self.sizes.items()}
+            for one in self.variables.values():
+                one.dims = tuple("range" if dim == "altitude" else dim for dim in one.dims)
 
     def __contains__(self, name: str) -> bool:
         """Return whether there is a variable of this name."""
@@ -269,14 +283,12 @@ class StoredProduct:
 
 
 @contextmanager
-def opened_stored(path: str | Path, *, in_parts: bool = False) -> Iterator[StoredProduct]:
-    """Open a NetCDF-4 file; what is raised while it is open names it.
+def open_stored(path: str | Path) -> Iterator[StoredProduct]:
+    """Open a NetCDF-4 file; what is raised while it is open passes, but for reading values.
 
     Parameters
     ----------
     path : path or str
-    in_parts : bool
-        Whether no variable is read as a whole, so that it may be larger than memory.
 
     Yields
     ------
@@ -285,18 +297,13 @@ def opened_stored(path: str | Path, *, in_parts: bool = False) -> Iterator[Store
     Raises
     ------
     ProductError
-        If it cannot be read, states more than it can hold (naming the variable), or does not fit
-        into memory.
+        If it cannot be read, or states more than it can hold (naming the variable).
     """
-    with reading(path), stored_product(path, in_parts=in_parts) as product:
+    with ExitStack() as until_closed:
+        with reading(path):
+            file = until_closed.enter_context(h5py.File(path, "r"))
+            product = StoredProduct(file, path)
         yield product
-
-
-@contextmanager
-def stored_product(path: str | Path, *, in_parts: bool = False) -> Iterator[StoredProduct]:
-    """Open a NetCDF-4 file as `opened_stored`, but pass on what is raised while it is open."""
-    with h5py.File(path, "r") as file:
-        yield StoredProduct(file, path, in_parts=in_parts)
 
 
 def stored_values(path: str | Path, key: str, name: str, rows: slice = slice(None)) -> NDArray[Any]:
@@ -354,20 +361,20 @@ def _from_elsewhere(path: str | Path, name: str) -> ProductError:
     return ProductError(problem, file=path, field=name, remedy=_DISTRUST)
 
 
-def _refuse_large(stated: Mapping[str, int], path: str | Path, *, in_parts: bool) -> None:
-    """Refuse variables that cannot be in their file, or do not fit into memory."""
-    size = Path(path).stat().st_size
-    largest = max(stated, key=lambda name: stated[name], default="")
-    memory = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for held, most, able in (
-        (sum(stated.values()), _DEFLATE_LIMIT * size + _UNWRITTEN, "hold"),
-        (0 if in_parts else stated.get(largest, 0), memory, "be read on this machine"),
-    ):
-        if held > most:
-            raise ProductError(
-                f"states {held / _GIGABYTE:.3g} GB of values, but a file of {size} bytes can"
-                f" {able} at most {most / _GIGABYTE:.3g} GB",
-                file=path,
-                field=largest,
-                remedy=_DISTRUST,
-            )
+def _refuse_bomb(stated: Mapping[str, int], path: str | Path) -> None:
+    """Refuse variables that cannot be in their file."""
+    size, held = Path(path).stat().st_size, sum(stated.values())
+    most = _DEFLATE_LIMIT * size + _UNWRITTEN
+    if held > most:
+        largest = max(stated, key=lambda name: stated[name])
+        raise _too_large(held, most, f"be in a file of {size} bytes", path, largest)
+
+
+def _too_large(held: int, most: float, able: str, path: str | Path, name: str) -> ProductError:
+    return ProductError(
+        f"states {held / _GIGABYTE:.3g} GB of values, but at most {most / _GIGABYTE:.3g} GB can"
+        f" {able}",
+        file=path,
+        field=name,
+        remedy=_DISTRUST,
+    )

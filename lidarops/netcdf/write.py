@@ -184,10 +184,6 @@ class Skeleton:
             if unlimited in variable.dims or large:
                 self.chunks[name] = chunk_sizes(variable.shape, variable.dtype.itemsize)
 
-    def is_scale(self, name: str) -> bool:
-        """Return whether HDF5 may know a variable by its name: no other dimension has it."""
-        return name not in self.sizes or self.variables[name].dims == (name,)
-
 
 class QuietFile(io.FileIO):
     """A local file for HDF5, which may crash where it cannot write.
@@ -414,9 +410,11 @@ def _define(skeleton: Skeleton, root: Any) -> dict[str, Any]:
     netCDF-C would write attributes from the ninth of a variable on, and the index of its chunks,
     in blocks of some kB each: most of a small product.
     """
+    sizes = skeleton.sizes
+    # HDF5 may know a variable by its name where no other dimension has it.
     inside = {
-        name: name if skeleton.is_scale(name) else f"{OTHER_DIMENSION}{name}"
-        for name in skeleton.variables
+        name: name if name not in sizes or one.dims == (name,) else f"{OTHER_DIMENSION}{name}"
+        for name, one in skeleton.variables.items()
     }
     found = {
         name: _dataset(root, inside[name], variable, skeleton.chunks.get(name), skeleton.unlimited)
@@ -424,7 +422,7 @@ def _define(skeleton: Skeleton, root: Any) -> dict[str, Any]:
     }
     scales: dict[str, Any] = {}
     uses: dict[str, list[tuple[Any, int]]] = {}
-    for number, (dim, size) in enumerate(skeleton.sizes.items()):
+    for number, (dim, size) in enumerate(sizes.items()):
         if inside.get(dim) == dim:
             scales[dim], label = found[dim], dim
         else:

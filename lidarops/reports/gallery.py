@@ -25,7 +25,8 @@ from lidarops.figures.raster import COLUMNS, Kept
 from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
-from lidarops.netcdf.read import open_product, opened_product
+from lidarops.netcdf.read import open_product
+from lidarops.netcdf.stored import reading
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord
 from lidarops.system.processes import CRASHED, Processes
@@ -199,7 +200,8 @@ def _title(group: Group, unreadable: Collection[str]) -> str:
     """Return channel and instrument as people call them, by the first product that can be read."""
     # What crashed another process would crash this one.
     for path in (one.path for one in group.products if one.path not in unreadable):
-        with suppress(ProductError), opened_product(group.root / path) as opened:
+        file = group.root / path
+        with suppress(ProductError), reading(file), open_product(file, ["wavelength"]) as opened:
             name = attribute(opened, "instrument", group.instrument)
             return f"{light_in_words(opened) or group.channel}, {name}"
     return group.label

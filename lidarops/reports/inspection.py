@@ -19,7 +19,8 @@ import xarray as xr
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import LidarOpsError, RawFormatError
-from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
+from lidarops.netcdf.read import decoded, is_netcdf, read_provenance
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
     bits_of,
@@ -184,7 +185,10 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 
 def _product(file: Path, time: str) -> dict[str, Any]:
-    with opened_product(file, decode_times=False) as opened:
+    with reading(file), open_stored(file) as stored:
+        for one in stored.variables.values():
+            one.dims = one.written
+        opened = decoded(stored, stored.variables, decode_times=False)
         dataset = _profile(opened, time, file) if time else opened
         steps = product_contents.origin(dataset).get("steps", [])
         return {

@@ -17,7 +17,7 @@ from lidarops.figures.kind_figures import View, image_view, view_of, views_of
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.figures.raster import COLUMNS
 from lidarops.flags import Severity
-from lidarops.netcdf.read import is_netcdf, open_product, opened_product
+from lidarops.netcdf.read import is_netcdf, open_product
 from lidarops.netcdf.stored import reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.raw.archive import open_archive
@@ -90,7 +90,7 @@ def draw_file(path: Path, chosen: Selection = ALL) -> tuple[Figure, ...]:
 
 
 def _of_product(path: Path, chosen: Selection) -> Iterator[Figure]:
-    with opened_product(path, decode_times=False) as opened:
+    with reading(path), open_product(path, decode_coords=True) as opened:
         kind = str(opened.attrs.get("lidarops_kind", ""))
         if not kind:
             raise ProductError(
@@ -167,7 +167,9 @@ def draw_change(old: Path, new: Path) -> tuple[Figure, ...]:
     ProductError
         If a file cannot be read, or holds no quantity with an error over range or altitude.
     """
-    with opened_product(old) as before, opened_product(new) as after:
+    with reading(new), open_product(old) as former, open_product(new) as latter:
+        # With indexes, so that values at the same times and places are compared.
+        before, after = (xr.Dataset(product.variables) for product in (former, latter))
         profiles = (
             str(name)
             for name, values in before.data_vars.items()

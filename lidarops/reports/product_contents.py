@@ -51,7 +51,7 @@ def variables(product: StoredProduct) -> list[tuple[str, str, str, str]]:
     return [
         (
             name,
-            ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
+            ", ".join(map("{} {}".format, variable.written, variable.shape)),
             str(variable.attrs.get("units", "")),
             str(variable.attrs.get("long_name", "")),
         )

@@ -25,8 +25,7 @@ from lidarops.catalog.store import Dependence, LastTry, NewProduct, Run, RunStat
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import product_path
-from lidarops.netcdf.read import opened_product
-from lidarops.netcdf.stored import reading
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
     all_bits,
@@ -494,11 +493,11 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
 
 def _verdicts(file: Path) -> Verdicts:
     """Return the numbers of values of a product, which may be larger than memory."""
-    with opened_product(file, in_parts=True, decode_cf=False) as product:
+    with open_stored(file) as product:
         counts = FlagCounter(rejecting_mask(all_bits(product)))
         for name in flags_names(product):
             for block in blocks(product[name], _BLOCK):
-                counts.add(block.to_numpy())
+                counts.add(block)
     return counts.verdicts
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, TypeVar
 
@@ -21,7 +22,8 @@ from lidarops.campaign.model import CATALOG_VARIABLE, Campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.context import package_versions
-from lidarops.netcdf.read import opened_product, read_origin
+from lidarops.netcdf.read import open_product, read_origin
+from lidarops.netcdf.stored import reading
 from lidarops.raw.formats import RawFile, read_raw_header
 from lidarops.raw.header import named_layout, recorder_names
 from lidarops.records import (
@@ -542,9 +544,9 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
         return
     if record.sha256 != sha256_of(recipe.file):
         files = (recipe.file, out / "products" / record.path)
-        old, new = (opened_product(file, decode_cf=False) for file in files)
+        stored = partial(open_product, mask_and_scale=False, decode_times=False)
         same = Difference("bytes", recipe.file.name, "the same content, stored in other bytes")
-        with old as recorded, new as made:
+        with reading(files[1]), stored(files[0]) as recorded, stored(files[1]) as made:
             yield from list(_differences(recorded, made)) or [same]
 
 

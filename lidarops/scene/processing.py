@@ -24,7 +24,7 @@ from lidarops.flags import Quality
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import Context, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
-from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.raw.header import Stretches
 from lidarops.records import (
@@ -286,8 +286,8 @@ class _Instrument(_Work):
         job, kind = self.job, step.product
         read = [self._read(path) for path in self._paths_read(step)]
         first = next(product.file for product in read if product.channel == step.channel)
-        with opened_product(first, in_parts=True, decode_cf=False) as product:
-            wavelength = float(product["wavelength"]) * 1e-9
+        with reading(first), open_stored(first) as product:
+            wavelength = float(product["wavelength"][...]) * 1e-9
             stated = product.attrs["lidarops_detection_mode"]
         mode = mode_of_signal(step.channel, stated)
         channel = product_channel(step.channel, mode, wavelength)

@@ -27,8 +27,8 @@ from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
-from lidarops.netcdf.read import dataset_of, decoded
-from lidarops.netcdf.stored import UNREADABLE, StoredProduct, opened_stored, reading
+from lidarops.netcdf.read import decoded
+from lidarops.netcdf.stored import UNREADABLE, StoredProduct, open_stored, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.reports import product_contents
@@ -220,7 +220,7 @@ def _crashed(task: _Task) -> _Outcome:
 
 
 def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry:
-    with opened_stored(file) as stored:
+    with reading(file), open_stored(file) as stored:
         kind = attribute(stored, "lidarops_kind")
         opened = _decoded(stored, kind)
         quality, no_quality = _quality(opened, below)
@@ -312,7 +312,7 @@ def _draw(
     except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        whole = xr.decode_cf(dataset_of(stored), decode_timedelta=False)
+        whole = decoded(stored, stored.variables, decode_coords=True)
         return _figures(whole, [view_of(kind)], quality), problem
     except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"

@@ -20,7 +20,7 @@ from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.stored import opened_stored, stored_product
+from lidarops.netcdf.stored import open_stored
 from lidarops.netcdf.variables import summarize_flags
 
 
@@ -76,8 +76,8 @@ def test_variables_of_a_whole_product_have_the_dimension_product(tmp_path: Path)
             change=lambda data, day=day: data.assign(lidar_ratio=data.lidar_ratio - 10.0 + day),
         )
     data = open_products(tmp_path)
-    assert data.lidar_ratio.dims == ("product", "range")
-    ratio = data.lidar_ratio.isel(range=0)
+    assert data.lidar_ratio.dims == ("product", "altitude")
+    ratio = data.lidar_ratio.isel(altitude=0)
     np.testing.assert_array_equal(ratio, [40.0, 41.0])
     ratio = ratio.isel(product=data.product_index)
     np.testing.assert_array_equal(ratio, np.repeat([40.0, 41.0], 5))
@@ -159,9 +159,9 @@ def test_only_selected_files_are_opened_and_each_once_but_for_the_first(
     since = {"kind": "homogeneous", "since": "2026-03-03"}
     with monkeypatch.context() as patch:
         patch.setattr(xr, "open_dataset", counting(xr.open_dataset))
-        place = "lidarops.aggregate.open_products.opened_stored"
-        patch.setattr(place, counting(opened_stored))
-        patch.setattr("lidarops.aggregate.facts.stored_product", counting(stored_product))
+        place = "lidarops.aggregate.open_products.open_stored"
+        patch.setattr(place, counting(open_stored))
+        patch.setattr("lidarops.aggregate.facts.open_stored", counting(open_stored))
         data = open_products(tmp_path, **since)
     selected = [facts.path for facts in facts_of(tmp_path) if facts.kind == "homogeneous"][2:]
     assert new in selected
@@ -173,17 +173,18 @@ def test_only_selected_files_are_opened_and_each_once_but_for_the_first(
 
 
 def test_a_vertical_lidar_can_be_selected_by_altitude(archive: Path):
-    data = open_products(archive, kind="elastic", on_altitude=True)
+    data = open_products(archive, kind="elastic")
     part = data.aerosol_backscatter.sel(altitude=slice(100.0, 200.0))
     altitude = data["station_altitude"] + data["range"]
     np.testing.assert_allclose(data["altitude"], altitude, atol=0.01)
     assert part.sizes["altitude"] == np.count_nonzero((altitude >= 100.0) & (altitude <= 200.0)) > 9
 
 
-def test_a_level_beam_has_no_altitudes(tmp_path: Path):
-    add_day(tmp_path, 0, "signal", zenith=90.0)
-    with pytest.raises(RetrievalInputError, match="on_altitude: beams are level or move"):
-        open_products(tmp_path, on_altitude=True)
+def test_a_slant_beam_is_selected_by_range(tmp_path: Path):
+    add_day(tmp_path, 0, "signal", zenith=60.0)
+    data = open_products(tmp_path)
+    assert data.signal.dims == ("time", "range")
+    assert data["altitude"].dims == ("range",)
 
 
 def test_wrong_arguments_raise_clear_errors(archive: Path, tmp_path: Path):

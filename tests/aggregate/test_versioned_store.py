@@ -114,7 +114,7 @@ def test_a_product_made_again_replaces_its_times_and_the_snapshot_before_stays(t
     ]
     assert_like_products(tmp_path)
     data = open_products(store_path(tmp_path, KIND), usable=2)
-    changed = (data.signal.fillna(0) != old.signal.fillna(0)).any("range").values
+    changed = (data.signal.fillna(0) != old.signal.fillna(0)).any("altitude").values
     np.testing.assert_array_equal(changed, np.repeat([False, True, False], 5))
     stored = open_products(store_path(tmp_path, KIND), usable=2, version=before.snapshot)
     assert_same_bits(stored.load(), old)

@@ -54,7 +54,8 @@ def _open(record: RunRecord, kind: str, channel: str) -> xr.Dataset:
         if product.kind == kind and product.channel == channel
     ]
     assert len(paths) == 1
-    return xr.load_dataset(Path(record.products) / paths[0])
+    product = xr.load_dataset(Path(record.products) / paths[0])
+    return product.swap_dims(altitude="range") if "altitude" in product.dims else product
 
 
 def test_pilar_loses_no_file(pilar: RunRecord) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,14 @@ import pytest
 import xarray as xr
 from support.products.damaged_products import damage_values
 from support.products.encoded_products import build_product
-from support.products.made_products import context, elastic, homogeneous, provenance, visibility
+from support.products.made_products import (
+    context,
+    elastic,
+    homogeneous,
+    provenance,
+    signal,
+    visibility,
+)
 from typer.testing import CliRunner
 
 from lidarops.catalog import product_files
@@ -23,7 +31,7 @@ from lidarops.cli import app
 from lidarops.errors import ProductError
 from lidarops.figures.wording import change_in_words
 from lidarops.flags import Quality
-from lidarops.netcdf import stored
+from lidarops.netcdf import comparison, stored
 from lidarops.netcdf.comparison import compare_products, quantity_changes
 from lidarops.netcdf.write import write_product
 from lidarops.records import Change, Grade, InputRecord, Measure, Role, Stamp
@@ -303,8 +311,15 @@ def test_a_damaged_product_is_one_error(name: str, damaged: int, tmp_path: Path)
 
 
 def test_a_product_larger_than_memory_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(stored, "_MEMORY_SHARE", 1e-12)
-    assert compared(tmp_path).grade is Grade.NONE
+    files = [tmp_path / f"{name}.nc" for name in ("old", "new")]
+    for file in files:
+        write_product(build_product(signal(300, 2000), context("signal")), file)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    monkeypatch.setattr(stored, "_MEMORY_SHARE", 1e6 / memory)
+    with pytest.raises(ProductError, match="on this machine"):
+        compare_products(*files)
+    monkeypatch.setattr(comparison, "_BLOCK", 1 << 16)
+    assert compare_products(*files).grade is Grade.NONE
 
 
 def test_another_text_is_minor(tmp_path: Path):

@@ -69,6 +69,16 @@ def test_every_variable_of_every_kind_is_read_as_by_xarray(kind: str, tmp_path: 
             assert_same(found.variables[name], variable)
 
 
+def test_a_whole_product_has_the_coordinates_of_xarray(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    moving = signal(zenith=[0.0, 30.0, 60.0, 30.0, 90.0])
+    write_product(build_product(moving, context("signal")), path)
+    known = by_xarray(path)
+    with open_product(path, decode_coords=True) as found:
+        assert set(found.coords) == set(known.coords)
+        assert set(found.data_vars) == set(known.data_vars)
+
+
 def test_missing_values_are_nan(chunked: Path):
     with open_product(chunked, ["signal"]) as product:
         missing = np.isnan(product["signal"].values)

@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 from lidarops.errors import ProductError
 from lidarops.netcdf import stored
-from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.read import open_product
+from lidarops.netcdf.stored import open_stored
 
 
 def _unwritten(file: Path) -> None:
@@ -67,7 +68,7 @@ def _variable_length(file: Path) -> None:
 
 
 def check_sizes(path: Path) -> None:
-    with opened_product(path):
+    with open_product(path):
         pass
 
 
@@ -130,7 +131,7 @@ def test_other_products_are_aggregated_and_shown(
 
 
 def test_honest_files_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Values that compress as well as deflate can, small unwritten ones, and NetCDF-3."""
+    """Values that compress as well as deflate can, small unwritten ones, read in parts."""
     zeros = xr.Dataset({"x": ("t", np.zeros(20_000_000))})
     zeros.to_netcdf(tmp_path / "zeros.nc", encoding={"x": {"zlib": True, "complevel": 9}})
     assert (tmp_path / "zeros.nc").stat().st_size < 200_000
@@ -139,12 +140,17 @@ def test_honest_files_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         file.createDimension("t", 8_000_000)
         file.createVariable("x", "f8", ("t",), zlib=True)
     check_sizes(tmp_path / "unwritten.nc")
-    zeros.isel(t=slice(9)).to_netcdf(tmp_path / "old.nc", format="NETCDF3_64BIT")
-    check_sizes(tmp_path / "old.nc")
     # On a machine of little memory.
     monkeypatch.setattr(stored, "_MEMORY_SHARE", 1e-6)
-    with pytest.raises(ProductError, match=r"x: .*on this machine"):
-        check_sizes(tmp_path / "zeros.nc")
+    with open_product(tmp_path / "zeros.nc") as product:
+        assert not product["x"][100:200:3].any()
+        with pytest.raises(ProductError, match=r"x: .*on this machine"):
+            product["x"].load()
+    with (
+        open_stored(tmp_path / "zeros.nc") as product,
+        pytest.raises(ProductError, match=r"x: .*on this machine"),
+    ):
+        product["x"][...]
 
 
 def test_inspect_reads_large_variables_in_parts(tmp_path: Path) -> None:

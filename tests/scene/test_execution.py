@@ -310,7 +310,7 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "notes": (),
     }
     product = build_product(retrieved, Context(**settings))
-    assert product["aerosol_backscatter"].dims == ("time", "range")
+    assert product["aerosol_backscatter"].dims == ("time", "altitude")
     stored = product["aerosol_backscatter"].to_numpy()
     np.testing.assert_allclose(
         stored[np.isfinite(retrieved["aerosol_backscatter"])],

@@ -125,6 +125,23 @@ def test_cdo_joins_days_and_keeps_bits(product: Path, for_cdo: Path, tmp_path: P
         np.testing.assert_array_equal(flags, np.squeeze(before["quality_flag"].to_numpy()))
 
 
+@needs("cdo")
+@pytest.mark.parametrize("kind", ["signal", "elastic", "raman"])
+def test_cdo_selects_altitudes_of_vertical_lidars(
+    kind: str, made: Callable[[str, str], Path], tmp_path: Path
+):
+    product = made(kind, "vertical")
+    with xr.open_dataset(product) as opened:
+        name = next(iter(values_of(product)))
+        shown = call("cdo", "-s", "showlevel", f"-selname,{name}", product).stdout
+        levels = np.array(shown.split(), float)
+        np.testing.assert_allclose(levels, opened["altitude"], rtol=1e-6)
+        call("cdo", "-s", f"sellevel,{levels[2]}", f"-selname,{name}", product, tmp_path / "one.nc")
+        with xr.open_dataset(tmp_path / "one.nc") as one:
+            expected = opened[name].sel(altitude=levels[2], method="nearest")
+            np.testing.assert_array_equal(np.squeeze(one[name].to_numpy()), expected)
+
+
 @needs("ncra")
 def test_nco_takes_means_over_time(product: Path, tmp_path: Path):
     call("ncra", "--dbl", product, tmp_path / "mean.nc")
