@@ -147,6 +147,8 @@ class Ancillaries:
     lidar_ratios: Mapping[str, LidarRatio]
     inputs: tuple[InputRecord, ...]
     """In order of file names."""
+    folder: Path = Path()
+    """That of the campaign file."""
 
     @classmethod
     def read(cls, folder: Path, files: Mapping[str, Role]) -> Self:
@@ -168,12 +170,15 @@ class Ancillaries:
         for name, role in sorted(files.items()):
             if role is Role.MOLECULAR:
                 profiles[name], digest = molecular_profile(folder, name)
+            elif role is Role.ATMOSPHERE:
+                # The air of the plan reads the profile that it chose.
+                digest = hashlib.sha256(read_file(folder, name)).hexdigest()
             elif role is Role.LIDAR_RATIO:
                 lidar_ratios[name], digest = lidar_ratio_profile(folder, name)
             else:
                 overlaps[name], digest = overlap_profile(folder, name)
             inputs.append(InputRecord(name, role, digest))
-        return cls(profiles, overlaps, lidar_ratios, tuple(inputs))
+        return cls(profiles, overlaps, lidar_ratios, tuple(inputs), folder)
 
 
 def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:

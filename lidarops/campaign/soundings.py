@@ -40,8 +40,6 @@ Array = npt.NDArray[np.float64]
 
 _GRAVITY: Final = 9.80665
 """m s-2, by which geopotential height is defined."""
-_EARTH: Final = 6_371_000.0
-"""m, mean radius."""
 _MISSING: Final = -888.0
 """Values up to this are marks of what is missing: -999, -9999, -8888."""
 _FEWEST: Final = 5
@@ -67,12 +65,6 @@ class Sounding:
     origin: str
     """One of `ORIGINS`."""
     profile: MolecularProfile
-
-    def distance(self, latitude: float, longitude: float) -> float:
-        """Return the distance to a place along the surface of the earth, m."""
-        a, b, c, d = np.radians([self.latitude, latitude, self.longitude, longitude])
-        chord = np.sin((a - b) / 2.0) ** 2 + np.cos(a) * np.cos(b) * np.sin((c - d) / 2.0) ** 2
-        return float(2.0 * _EARTH * np.arcsin(min(1.0, np.sqrt(chord))))
 
 
 class Record(NamedTuple):

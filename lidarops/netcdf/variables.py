@@ -667,12 +667,39 @@ def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
 
 
 MOLECULAR_SOURCE: Final = coded(
-    "molecular_source",
-    "source of pressure and temperature of the molecular atmosphere",
-    ("standard_atmosphere", "sounding"),
-    "standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or model"
-    " that the campaign gives; provenance names it.",
+    "atmospheric_molecular_calculation_source",
+    "data source of the atmospheric molecular calculations",
+    ("US_standard_atmosphere", "radiosounding", "ecmwf", "icon-iglo-12-23", "gdas"),
+    "As in files of EARLINET. radiosounding: also any file that molecular_profile names."
+    " icon-iglo-12-23: any run of ICON. provenance names the files.",
 )
+MOLECULES: Final = (
+    MOLECULAR_SOURCE,
+    *(
+        per_profile(f"molecular_{name}", long_name, comment, dims=(), optional=True, units=units)
+        for name, long_name, comment, units in (
+            (
+                "profile_age",
+                "time between the middle of the scene and the nearest profile of the air",
+                "Missing where the campaign gives no sources, or none of them holds.",
+                "s",
+            ),
+            (
+                "profile_distance",
+                "distance between the station and the farthest profile of the air",
+                "Missing where the campaign gives no sources, or none of them holds.",
+                "m",
+            ),
+            (
+                "density_relative_error",
+                "relative standard error of the number density of molecules",
+                "By source and age of the profiles. Missing where the campaign gives no sources.",
+                "1",
+            ),
+        )
+    ),
+)
+"""Variables of the air of a scene."""
 BACKGROUND_METHOD: Final = coded(
     "background_method",
     "method by which the background is estimated",

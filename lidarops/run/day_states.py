@@ -28,6 +28,7 @@ from lidarops.records import FileNote, Granule, Role, UnusedFile, day_of, digest
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.run.outlying_headers import NEAR_DAYS
 from lidarops.run.scenes import RefusedFile, dated
+from lidarops.scene.air import AirFiles
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 
@@ -87,6 +88,7 @@ class DayStates:
         self._problems: dict[tuple[str, Role], str] = {}
         if known is not None:
             self.base, self.names, self.refused = known.base, known.names, known.refused
+            self.air = known.air
             self.read_by_months = known.read_by_months
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
@@ -135,10 +137,16 @@ class DayStates:
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
                 [entry.what for entry in self.campaign.acknowledged if entry.holds],
+                self.air.state,
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
                 sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]
         )
+
+    @cached_property
+    def air(self) -> AirFiles:
+        """Files of the sources of the air."""
+        return AirFiles(self.campaign)
 
     @cached_property
     def read_by_months(self) -> frozenset[str]:

@@ -186,6 +186,12 @@ def _unusable_files(
             problem = states.file_problem(path, role)
             if problem:
                 yield UnusableFile(name, key, path, problem)
+    stations: dict[str, str] = {}
+    for name in instruments:
+        stations.setdefault(states.campaign.instruments[name].station, name)
+    for station, name in stations.items():
+        for path, problem in states.air.problems(station).items():
+            yield UnusableFile(name, "atmosphere", path, problem)
 
 
 def _unmade(

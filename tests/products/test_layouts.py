@@ -109,7 +109,7 @@ def test_variables_without_standard_name():
             "molecular_backscatter",
             "molecular_extinction",
             *reference,
-            "molecular_source",
+            "atmospheric_molecular_calculation_source",
             "background_method",
             "vertical_resolution",
             "cloud_base_range",
@@ -136,7 +136,7 @@ def test_variables_without_standard_name():
             "overlap_standard_error",
             "molecular_backscatter",
             *reference,
-            "molecular_source",
+            "atmospheric_molecular_calculation_source",
             "background_method",
             "background",
             "background_standard_error",
@@ -231,7 +231,9 @@ def test_method_codes_are_published_and_keep_their_numbers():
         ),
         **{(kind, "background_method"): background
            for kind in ("signal", "elastic", "raman", "multiangle")},
-        **{(kind, "molecular_source"): ("standard_atmosphere", "sounding")
+        **{(kind, "atmospheric_molecular_calculation_source"): (
+            "US_standard_atmosphere", "radiosounding", "ecmwf", "icon-iglo-12-23", "gdas",
+        )
            for kind in ("elastic", "raman")},
     }  # fmt: skip
 
