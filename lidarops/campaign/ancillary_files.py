@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -147,7 +147,7 @@ class Ancillaries:
     lidar_ratios: Mapping[str, LidarRatio]
     inputs: tuple[InputRecord, ...]
     """In order of file names."""
-    folder: Path = Path()
+    folder: Path = field(default=Path(), compare=False)
     """That of the campaign file."""
 
     @classmethod

@@ -54,7 +54,7 @@ _MONTHS: Final = "JanFebMarAprMayJunJulAugSepOctNovDec"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sounding:
+class TimedProfile:
     """The air over one place at one time."""
 
     time: datetime
@@ -136,7 +136,7 @@ _PLACE: Final = {"latitude": ("latitude", "lat"), "longitude": ("longitude", "lo
 
 def soundings(
     folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
-) -> tuple[Sounding, ...]:
+) -> tuple[TimedProfile, ...]:
     """Return the profiles of a file that can be used, in the order of the file.
 
     Parameters
@@ -525,7 +525,7 @@ def _time_and_place(
     return time, place
 
 
-def _sounding(record: Record, name: str, reading: AtmosphereReading) -> Sounding:
+def _sounding(record: Record, name: str, reading: AtmosphereReading) -> TimedProfile:
     """Return a profile in SI, of the levels that are complete, by rising altitude."""
     found = {
         quantity: values
@@ -571,7 +571,7 @@ def _sounding(record: Record, name: str, reading: AtmosphereReading) -> Sounding
         problem, field, remedy = error.problem, error.field, error.remedy
         raise AncillaryError(problem, file=name, field=field, remedy=remedy) from error
     refuse_wide_levels(profile, name)
-    return Sounding(time, *place, record.origin, profile)
+    return TimedProfile(time, *place, record.origin, profile)
 
 
 def _in_si(columns: Table, quantity: str, name: str) -> Array | None:

@@ -86,10 +86,10 @@ class DayStates:
         self.selection = selection or Selection()
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
+        self.air = AirFiles(campaign) if campaign.atmosphere else None
         if known is not None:
             self.base, self.names, self.refused = known.base, known.names, known.refused
-            self.air = known.air
-            self.read_by_months = known.read_by_months
+            self.air, self.read_by_months = known.air, known.read_by_months
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
         """Return the state of every day.
@@ -137,16 +137,11 @@ class DayStates:
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
                 [entry.what for entry in self.campaign.acknowledged if entry.holds],
-                self.air.state,
+                self.air and self.air.state,
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
                 sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]
         )
-
-    @cached_property
-    def air(self) -> AirFiles:
-        """Files of the sources of the air."""
-        return AirFiles(self.campaign)
 
     @cached_property
     def read_by_months(self) -> frozenset[str]:

@@ -186,11 +186,8 @@ def _unusable_files(
             problem = states.file_problem(path, role)
             if problem:
                 yield UnusableFile(name, key, path, problem)
-    stations: dict[str, str] = {}
-    for name in instruments:
-        stations.setdefault(states.campaign.instruments[name].station, name)
-    for station, name in stations.items():
-        for path, problem in states.air.problems(station).items():
+        station = states.campaign.instruments[name].station
+        for path, problem in states.air.problems(station).items() if states.air else ():
             yield UnusableFile(name, "atmosphere", path, problem)
 
 

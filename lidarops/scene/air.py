@@ -66,8 +66,6 @@ class ChosenAir(SettingsModel):
     place: tuple[float, float]
     """Latitude and longitude of the station, degree."""
     age: float = quantity(unit="s", description="from the middle to the nearest profile")
-    relative_error: float
-    """Standard error of the density."""
     reading: AtmosphereReading
 
     @property
@@ -75,16 +73,15 @@ class ChosenAir(SettingsModel):
         """Largest distance of a profile from the station, m."""
         return max(profile.distance for profile in self.profiles)
 
-    @property
-    def words(self) -> str:
-        """The profiles in words, for products."""
+    def words(self, error: float) -> str:
+        """Return the profiles in words, for products, with the relative error of the density."""
         parts = (
             f"{one.file} of {one.time:%Y-%m-%dT%H:%MZ} ({one.share:.3g})" for one in self.profiles
         )
         return (
             f"molecular: {self.origin}, {' and '.join(parts)}, for {self.time:%Y-%m-%dT%H:%MZ};"
             f" age {self.age / 3600.0:.3g} h, distance {self.distance / 1000.0:.3g} km, relative"
-            f" error of density {self.relative_error:.2g}"
+            f" error of density {error:.2g}"
         )
 
     def profile(self, folder: Path) -> MolecularProfile:
@@ -142,13 +139,13 @@ class AirFiles:
 
     @cached_property
     def state(self) -> str:
-        """Digest of names, sizes and modification times of the files; empty without sources."""
+        """Digest of names, sizes and modification times of the files."""
         rows = [
             [station, number, file.path, file.size, file.mtime_ns]
             for (station, number), files in self._listed.items()
             for file in files
         ]
-        return digest(rows) if self._listed else ""
+        return digest(rows)
 
     @cached_property
     def _found(self) -> tuple[dict[tuple[str, int], list[_Found]], dict[str, dict[str, str]]]:
@@ -177,14 +174,17 @@ class AirFiles:
 
     def problems(self, station: str) -> dict[str, str]:
         """Return the files of a station that cannot be used, or patterns without file -> why."""
-        return self._found[1].get(station, {}) if self._listed else {}
+        return self._found[1].get(station, {})
 
     def is_given(self, station: str) -> bool:
         """Return whether the campaign gives sources for a station."""
         return bool(self._campaign.atmosphere.get(station))
 
-    def of_scene(self, scene: Scene) -> ChosenAir | None:
-        """Return the air of a scene by the first source that holds; None where none does."""
+    def of_scene(self, scene: Scene) -> tuple[ChosenAir, float] | None:
+        """Return the air of a scene, and the relative error of its density.
+
+        By the first source that holds; None where none does.
+        """
         starts = [granule.start for granule in scene.granules if granule.start]
         stops = [granule.stop or granule.start for granule in scene.granules if granule.start]
         begin, length = min(starts), max(filter(None, stops)) - min(starts)
@@ -226,7 +226,7 @@ def _chosen(
     length: timedelta,
     source: AtmosphereSource,
     place: tuple[float, float],
-) -> ChosenAir:
+) -> tuple[ChosenAir, float]:
     hours = [abs(one.time - time) / _HOUR for _, one in near]
     shares = [1.0] if len(near) == 1 else [hours[1] / sum(hours), hours[0] / sum(hours)]
     # Between two profiles the error of a random walk is that of a bridge. The measurements are, in
@@ -234,7 +234,7 @@ def _chosen(
     away = hours[0] * shares[0] if len(near) > 1 else hours[0]
     own = SOURCE_ERROR if source.relative_error is None else source.relative_error
     variance = own**2 + GROWTH**2 * (away + length / _HOUR / 4.0)
-    return ChosenAir(
+    air = ChosenAir(
         origin=near[hours.index(min(hours))][1].origin,
         profiles=[
             AirProfile(
@@ -249,9 +249,9 @@ def _chosen(
         time=time,
         place=place,
         age=min(hours) * 3600.0,
-        relative_error=float(f"{min(sqrt(variance), STANDARD_ERROR):.3g}"),
         reading=AtmosphereReading.taken_from(source),
     )
+    return air, float(f"{min(sqrt(variance), STANDARD_ERROR):.3g}")
 
 
 def _distance(one: _Found, place: tuple[float, float]) -> float:

@@ -44,7 +44,7 @@ from lidarops.retrieve.signal.dead_time import (
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, ChannelLag, enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene.air import AirFiles, ChosenAir
+from lidarops.scene.air import STANDARD_ERROR, AirFiles, ChosenAir
 from lidarops.scene.case import (
     DARK_FILES,
     LAG_STEP,
@@ -453,30 +453,31 @@ class MolecularSettings(SettingsModel):
     """Ancillary file of pressure and temperature that the facts name."""
     atmosphere: ChosenAir | None = None
     """Profiles of the first source that holds."""
-    stands_in: bool = False
-    """Whether the standard atmosphere stands for sources of which none holds.
+    relative_error: float | None = None
+    """Standard error of the density, of sources or of the standard atmosphere that stands for them.
 
     With neither file nor profiles, the air is that of the US Standard Atmosphere 1976.
     """
 
 
-def plan_molecular(case: ChannelCase[Any], air: AirFiles) -> Entry:
+def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
     """Give the density of the air, of a file, of sources or of the standard atmosphere."""
     if source := case.facts.molecular_profile:
         settings = MolecularSettings(molecular_profile=source)
         return case.run(AIR, "given by the campaign", settings)
-    if not air.is_given(case.scene.station):
+    if air is None or not air.is_given(case.scene.station):
         reason = "the campaign gives neither molecular_profile nor atmosphere; US Standard"
         return case.run(AIR, f"{reason} Atmosphere 1976 is used", MolecularSettings())
     chosen = air.of_scene(case.scene)
     if chosen is not None:
         reason = "nearest profiles of the first source of the atmosphere that holds"
-        return case.run(AIR, reason, MolecularSettings(atmosphere=chosen), number=chosen.age)
+        settings = MolecularSettings(atmosphere=chosen[0], relative_error=chosen[1])
+        return case.run(AIR, reason, settings, number=chosen[0].age)
     warning = (
         "no source of the atmosphere holds: US Standard Atmosphere 1976 is used, and values are"
         " flagged standard_air"
     )
-    settings = MolecularSettings(stands_in=True)
+    settings = MolecularSettings(relative_error=STANDARD_ERROR)
     return case.run(AIR, "all sources are too far in time or place", settings, warning=warning)
 
 
@@ -577,7 +578,8 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"
         signal.profiles = glue(stages.glue, signal, estimated=estimated)
     if stages.molecular is not None:
-        signal.air, signal.stands_in = stages.molecular.atmosphere, stages.molecular.stands_in
+        signal.air = stages.molecular.atmosphere
+        signal.air_error = stages.molecular.relative_error
         signal.molecules = _molecules(stages.molecular, source)
 
 

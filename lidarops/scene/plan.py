@@ -75,7 +75,9 @@ def plan_scene(scene: Scene, campaign: Campaign, air: AirFiles | None = None) ->
             for entry in making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
         )
     elif scene.granules:
-        entries = _entries(scene, campaign, air or AirFiles(campaign))
+        if air is None and campaign.atmosphere:
+            air = AirFiles(campaign)
+        entries = _entries(scene, campaign, air)
     else:
         entries = _month_entries(scene, campaign)
     linked = _linked(list(entries))
@@ -97,7 +99,7 @@ def plan_scene(scene: Scene, campaign: Campaign, air: AirFiles | None = None) ->
     )
 
 
-def _entries(scene: Scene, campaign: Campaign, air: AirFiles) -> Entries:
+def _entries(scene: Scene, campaign: Campaign, air: AirFiles | None) -> Entries:
     # A scene never spans an edge of a validity period, so the facts of its first granule hold.
     facts = scene_facts(campaign, scene)
     wanted = campaign.instruments[scene.instrument].products.requested
@@ -218,7 +220,7 @@ def _derived_entries(
             yield entry
 
 
-def _channel_entries(case: ChannelCase[Any], air: AirFiles) -> list[Entry]:
+def _channel_entries(case: ChannelCase[Any], air: AirFiles | None) -> list[Entry]:
     """Return the entries of a channel: its conditioning, then product by product."""
     stages = plan_stages(case)
     if isinstance(stages[0], LeftOut):

@@ -363,8 +363,8 @@ def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> x
     """Return the frame of a product that states what steps decided from the data."""
     parts = counted_channels(context.plan.steps, signal.channel)
     words = [words for part in parts for words in signal.channels[part].statements]
-    if signal.air is not None and any(step.name == AIR for step in context.plan.steps):
-        words.append(signal.air.words)
+    if signal.air and signal.air_error and any(step.name == AIR for step in context.plan.steps):
+        words.append(signal.air.words(signal.air_error))
     stated = [frame.attrs["steps"]] if frame.attrs.get("steps") else []
     return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame
 

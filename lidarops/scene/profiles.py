@@ -22,7 +22,7 @@ from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.lag import ChannelLag
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene.air import STANDARD_ERROR, ChosenAir
+from lidarops.scene.air import ChosenAir
 
 Indices = npt.NDArray[np.int64]
 
@@ -293,20 +293,13 @@ class ChannelSignal:
     """The air, of channels with a product that needs it."""
     air: ChosenAir | None = None
     """The profiles that it is made of, if the campaign gives sources and one of them holds."""
-    stands_in: bool = False
-    """Whether the standard atmosphere stands for sources of which none holds."""
+    air_error: float | None = None
+    """Relative error of its density; None where the campaign gives no sources."""
     statements: list[str] = field(default_factory=list)
     """What was decided from the data, in words for the product."""
     notes: list[str] = field(default_factory=list)
     """What the report of the run states of the data, such as requested values that they do not
     give."""
-
-    @property
-    def air_error(self) -> float | None:
-        """Relative error of the density of the air; None where the campaign gives no sources."""
-        if self.air is not None:
-            return self.air.relative_error
-        return STANDARD_ERROR if self.stands_in else None
 
     @property
     def shots(self) -> xr.DataArray:

@@ -258,24 +258,19 @@ def with_methods(
     method = "before_pulse" if before else "known_shape" if known_shape else "tail_mean"
     if method == "known_shape":
         product = product.assign_attrs(references=KNOWN_SHAPE_PAPERS)
-    if signal.stands_in:
+    air, states = signal.air, MOLECULAR_SOURCE.states
+    if air is None and signal.air_error is not None:
         names = [str(name) for name in product if str(name).endswith(QUALITY_FLAG)]
         product = product.assign({name: product[name] | np.int32(standard_air) for name in names})
-    return product.assign(background_method=BACKGROUND_METHOD.code(method), **_air(signal))
-
-
-def _air(signal: ChannelSignal) -> dict[str, Any]:
-    """Return the variables of the air of a product."""
-    air, states = signal.air, MOLECULAR_SOURCE.states
     origin = air.origin if air else states[0 if signal.molecules.standard else 1]
     stated = {
         "molecular_profile_age": air.age if air else None,
         "molecular_profile_distance": air.distance if air else None,
         "molecular_density_relative_error": signal.air_error,
+        MOLECULAR_SOURCE.name: [state.startswith(origin) for state in states].index(True),
+        "background_method": BACKGROUND_METHOD.code(method),
     }
-    code = next(code for code, state in enumerate(states) if state.startswith(origin))
-    known = {key: value for key, value in stated.items() if value is not None}
-    return {MOLECULAR_SOURCE.name: code, **known}
+    return product.assign({key: value for key, value in stated.items() if value is not None})
 
 
 def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from support import sounding_texts
+from support.archives import sounding_texts
+from support.archives.sounding_texts import COLUMNS, HEIGHTS, LATITUDE, LONGITUDE, TEXTS
 from support.cases import each
-from support.sounding_texts import COLUMNS, HEIGHTS, LATITUDE, LONGITUDE, TEXTS
 
 from lidarops.campaign.atmosphere import AtmosphereReading
-from lidarops.campaign.soundings import Sounding, soundings
+from lidarops.campaign.soundings import TimedProfile, soundings
 from lidarops.errors import AncillaryError
 from lidarops.retrieve.air.molecular import MolecularProfile
 
@@ -25,11 +25,11 @@ PLACE = LATITUDE, LONGITUDE
 GIVEN = {"latitude": LATITUDE, "longitude": LONGITUDE}
 
 
-def read(path: Path, **given: object) -> tuple[Sounding, ...]:
+def read(path: Path, **given: object) -> tuple[TimedProfile, ...]:
     return soundings(path.parent, path.name, AtmosphereReading.model_validate(given), PLACE)
 
 
-def check(found: Sounding, *, geometric: bool = False) -> None:
+def check(found: TimedProfile, *, geometric: bool = False) -> None:
     """Compare with the standard atmosphere, of which the stand-ins are, up to 10 km."""
     z = np.array([500.0, 3000.0, 6000.0, 10_000.0])
     expected = MolecularProfile.us_standard().number_density(z)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
-from support import sounding_texts
+from support.archives import sounding_texts
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.netcdf.read import read_origin
@@ -19,7 +19,7 @@ from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.reproduction import reproduce_product
-from lidarops.scene.air import GROWTH, SOURCE_ERROR
+from lidarops.scene.air import GROWTH, SLOPE, SOURCE_ERROR
 from lidarops.simulate.campaign import simulate_campaign
 
 MIDDLE = datetime(2024, 9, 20, 21, 30, tzinfo=UTC)
@@ -94,11 +94,12 @@ def test_errors_follow_from_source_and_age(folder: Path) -> None:
         paths = [entity.get("lidarops:path") for entity in entities.values()]
         # Both files hold the same air, but other times.
         assert {"s-2.csv", "s6.csv"} <= set(paths)
-        # One standard error of density: 1 % by default.
-        ratio = (
-            product["aerosol_backscatter_error_molecular"]
-            / without[kind]["aerosol_backscatter_error_molecular"]
-        )
-        assert float(ratio.median()) == pytest.approx(100.0 * error, rel=0.1)
+        # By default 1 % of density, or 1.6e-5 m-1 of the derivative of its logarithm.
+        name, expected = {
+            "elastic": ("aerosol_backscatter_error_molecular", error / 0.01),
+            "raman": ("aerosol_extinction_error_molecular", SLOPE * error / 1.6e-5),
+        }[kind]
+        ratio = product[name] / without[kind][name]
+        assert float(ratio.median()) == pytest.approx(expected, rel=0.1)
         result = reproduce_product(path, archive=campaign.archive, ancillary=folder)
         assert result.identical, result.differences

@@ -7,18 +7,23 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from support import sounding_texts
-from support.archives import raw_archives
+from support import quick
+from support.archives import raw_archives, sounding_texts
 from support.archives.small_archive import DAY, Archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.records import RunRecord
+from lidarops.run import executor
 from lidarops.run.archive import reprocess
 
-pytestmark = pytest.mark.usefixtures("quickly")
-
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+@pytest.fixture(autouse=True)
+def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the processing of scenes by `quick.attempt`; other tests prove the retrievals."""
+    monkeypatch.setattr(executor, "attempt", quick.attempt)
 
 
 class Nights(Archive):
