@@ -6,15 +6,16 @@ counts. One profile holds for the scene: that of the middle of its measurements.
 
 from __future__ import annotations
 
+import json
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from datetime import datetime, timedelta
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import asin, cos, radians, sin, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from lidarops.campaign.atmosphere import AtmosphereReading, AtmosphereSource
 from lidarops.campaign.model import Campaign
@@ -22,6 +23,8 @@ from lidarops.catalog.raw_files import path_matcher
 from lidarops.errors import AncillaryError
 from lidarops.records import Scene, digest
 from lidarops.settings import Instant, SettingsModel, quantity
+from lidarops.system.code_version import module_version
+from lidarops.system.files import write_atomically
 
 if TYPE_CHECKING:
     from lidarops.retrieve.air.molecular import MolecularProfile
@@ -38,6 +41,8 @@ SLOPE: Final = 6e-4
 """m-1; error of the derivative of the logarithm of the density over height, per relative error."""
 _ONE_PLACE: Final = 10_000.0
 """m, within which soundings are taken for those of one place."""
+_KEPT: Final = "atmosphere.json"
+"""File in the output folder that keeps what the files of sources hold."""
 _EARTH: Final = 6_371_000.0
 """m, mean radius."""
 _HOUR: Final = timedelta(hours=1)
@@ -106,13 +111,8 @@ class _Found(NamedTuple):
     origin: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Listed:
-    """A file that a source names."""
-
-    path: str
-    size: int
-    mtime_ns: int
+_File = tuple[str, int, int]
+"""Path below the folder of the campaign file, size, modification time in ns."""
 
 
 class AirFiles:
@@ -129,7 +129,7 @@ class AirFiles:
         self._campaign = campaign
 
     @cached_property
-    def _listed(self) -> dict[tuple[str, int], list[_Listed]]:
+    def _listed(self) -> dict[tuple[str, int], list[_File]]:
         """Files of each source, by station and number."""
         return {
             (station, number): list(_files(self._campaign.folder, source))
@@ -140,32 +140,38 @@ class AirFiles:
     @cached_property
     def state(self) -> str:
         """Digest of names, sizes and modification times of the files."""
-        rows = [
-            [station, number, file.path, file.size, file.mtime_ns]
-            for (station, number), files in self._listed.items()
-            for file in files
-        ]
-        return digest(rows)
+        return digest([[*source, files] for source, files in self._listed.items()])
 
     @cached_property
     def _found(self) -> tuple[dict[tuple[str, int], list[_Found]], dict[str, dict[str, str]]]:
-        """Profiles of each source by time, and of each station path -> why it cannot be used."""
+        """Profiles of each source by time, and of each station path -> why it cannot be used.
+
+        What a file holds is kept beside the catalog, until the file or the code changes.
+        """
         found: dict[tuple[str, int], list[_Found]] = {}
         problems: dict[str, dict[str, str]] = {}
+        kept = Path(self._campaign.output, _KEPT)
+        known, used = _loaded(kept), dict[str, Any]()
+        version = module_version("lidarops.campaign.soundings")
         for (station, number), files in self._listed.items():
             source, place = self._source(station, number)
+            reading = AtmosphereReading.taken_from(source)
             told = problems.setdefault(station, {})
             profiles = found[station, number] = []
             if not files:
                 told[", ".join(source.files)] = "matches no file"
-            reading = AtmosphereReading.taken_from(source)
             for file in files:
-                folder = self._campaign.folder
-                read, problem = _read(folder, file, reading.model_dump_json(), place)
-                profiles += read
+                key = digest([file, reading.model_dump(mode="json"), place, version])
+                used[key] = known.get(key) or _read(self._campaign.folder, file[0], reading, place)
+                rows, problem = used[key]
+                profiles += [_Found(datetime.fromisoformat(time), *row) for time, *row in rows]
                 if problem:
-                    told[file.path] = problem
+                    told[file[0]] = problem
             profiles.sort()
+        if used != known:
+            # Without, files are read again.
+            with suppress(OSError):
+                write_atomically(kept, json.dumps(used).encode())
         return found, problems
 
     def _source(self, station: str, number: int) -> tuple[AtmosphereSource, tuple[float, float]]:
@@ -261,7 +267,7 @@ def _distance(one: _Found, place: tuple[float, float]) -> float:
     return 2.0 * _EARTH * asin(min(1.0, sqrt(chord)))
 
 
-def _files(folder: Path, source: AtmosphereSource) -> Iterator[_Listed]:
+def _files(folder: Path, source: AtmosphereSource) -> Iterator[_File]:
     """Yield the files that a source names, by path."""
     matches = path_matcher(source.files)
     # Nothing is listed beside the folders that the patterns name.
@@ -277,9 +283,9 @@ def _files(folder: Path, source: AtmosphereSource) -> Iterator[_Listed]:
             status = os.stat(folder / path)  # noqa: PTH116 - for each file, a Path is slow
         except OSError:
             # Reading it tells the problem.
-            yield _Listed(path, -1, -1)
+            yield path, -1, -1
             continue
-        yield _Listed(path, status.st_size, status.st_mtime_ns)
+        yield path, status.st_size, status.st_mtime_ns
 
 
 def _plain_parts(pattern: str) -> list[str]:
@@ -289,19 +295,25 @@ def _plain_parts(pattern: str) -> list[str]:
     return parts[: plain + 1]
 
 
-@lru_cache(maxsize=100_000)
 def _read(
-    folder: Path, file: _Listed, reading: str, place: tuple[float, float]
-) -> tuple[list[_Found], str]:
-    """Return the profiles of a file, or why it cannot be used; a file of one state is read once."""
+    folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
+) -> tuple[list[list[Any]], str]:
+    """Return the profiles of a file, as of `_Found`, or why it cannot be used."""
     from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
 
     try:
-        given = AtmosphereReading.model_validate_json(reading)
-        read = soundings(folder, file.path, given, place)
+        read = soundings(folder, name, reading, place)
     except AncillaryError as error:
-        return [], str(error).removeprefix(f"{file.path}: ")
+        return [], str(error).removeprefix(f"{name}: ")
     return [
-        _Found(one.time, file.path, number, one.latitude, one.longitude, one.origin)
+        [one.time.isoformat(), name, number, one.latitude, one.longitude, one.origin]
         for number, one in enumerate(read)
     ], ""
+
+
+def _loaded(kept: Path) -> dict[str, Any]:
+    """Return what a former run has kept; nothing where it cannot be read."""
+    try:
+        return dict(json.loads(kept.read_bytes()))
+    except (OSError, ValueError):
+        return {}
