@@ -155,19 +155,23 @@ def soundings(
     AncillaryError
         If the file holds none; the message names file, field and remedy.
     """
-    found, problems = [], []
-    for number, record in enumerate(_records(folder, name, reading, place), start=1):
-        try:
-            found.append(_sounding(record, name, reading))
-        except AncillaryError as error:
-            where = f"profile {number}: " if number > 1 else ""
-            problem = f"{where}{error.problem}"
-            problems.append(
-                AncillaryError(problem, file=name, field=error.field, remedy=error.remedy)
-            )
+    found: list[TimedProfile] = []
+    problem = AncillaryError("holds no profile", file=name, remedy="remove the file")
+    try:
+        for record in _records(folder, name, reading, place):
+            try:
+                found.append(_sounding(record, name, reading))
+            except AncillaryError as error:
+                problem = problem if problem.field else error
+    except AncillaryError:
+        raise
+    # RuntimeError: an iterator that ends in a generator.
+    except (ValueError, LookupError, OverflowError, RuntimeError) as error:
+        raise AncillaryError(
+            f"is damaged: {error}", file=name, remedy="compare it with its origin"
+        ) from error
     if not found:
-        empty = AncillaryError("holds no profile", file=name, remedy="remove the file")
-        raise (problems or [empty])[0]
+        raise problem
     return tuple(found)
 
 
@@ -533,12 +537,9 @@ def _sounding(record: Record, name: str, reading: AtmosphereReading) -> TimedPro
         if (values := _in_si(record.columns, quantity, name)) is not None
     }
     heights = [found.pop(key) for key in _HEIGHTS if key in found]
-    for key, present in (
-        ("pressure", "pressure" in found),
-        ("temperature", "temperature" in found),
-        ("altitude", heights),
-    ):
-        if not present:
+    held = found.keys() | ({"altitude"} if heights else set())
+    for key in ("pressure", "temperature", "altitude"):
+        if key not in held:
             raise AncillaryError(
                 f"is missing; columns are {', '.join(record.columns) or 'none'}",
                 file=name,

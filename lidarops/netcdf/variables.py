@@ -673,29 +673,18 @@ MOLECULAR_SOURCE: Final = coded(
     "As in files of EARLINET. radiosounding: also any file that molecular_profile names."
     " icon-iglo-12-23: any run of ICON. provenance names the files.",
 )
+_SOURCES: Final = (
+    "Missing where the campaign gives no sources of the air; age and distance also where none of"
+    " them holds."
+)
 MOLECULES: Final = (
     MOLECULAR_SOURCE,
     *(
-        per_profile(f"molecular_{name}", long_name, comment, dims=(), optional=True, units=units)
-        for name, long_name, comment, units in (
-            (
-                "profile_age",
-                "time between the middle of the scene and the nearest profile of the air",
-                "Missing where the campaign gives no sources, or none of them holds.",
-                "s",
-            ),
-            (
-                "profile_distance",
-                "distance between the station and the farthest profile of the air",
-                "Missing where the campaign gives no sources, or none of them holds.",
-                "m",
-            ),
-            (
-                "density_relative_error",
-                "relative standard error of the number density of molecules",
-                "By source and age of the profiles. Missing where the campaign gives no sources.",
-                "1",
-            ),
+        per_profile(f"molecular_{name}", words, _SOURCES, dims=(), optional=True, units=units)
+        for name, words, units in (
+            ("profile_age", "time from the middle of the scene to the nearest profile of air", "s"),
+            ("profile_distance", "distance of the farthest profile of air from the station", "m"),
+            ("density_relative_error", "relative standard error of the density of molecules", "1"),
         )
     ),
 )

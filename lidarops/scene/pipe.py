@@ -474,8 +474,8 @@ def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
         settings = MolecularSettings(atmosphere=chosen[0], relative_error=chosen[1])
         return case.run(AIR, reason, settings, number=chosen[0].age)
     warning = (
-        "no source of the atmosphere holds: US Standard Atmosphere 1976 is used, and values are"
-        " flagged standard_air"
+        "no source of the atmosphere holds: US Standard Atmosphere 1976 is used, and values of"
+        " elastic and raman have the flag standard_air"
     )
     settings = MolecularSettings(relative_error=STANDARD_ERROR)
     return case.run(AIR, "all sources are too far in time or place", settings, warning=warning)

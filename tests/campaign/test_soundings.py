@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import zipfile
 from collections.abc import Callable
@@ -183,6 +184,32 @@ def test_other_files_are_refused_with_field_and_remedy(tmp_path: Path, what: str
     make(tmp_path / "s.nc")
     with pytest.raises(AncillaryError, match=rf"^s\.nc: {words}"):
         read(tmp_path / "s.nc")
+
+
+def _attempt(path: Path, **given: object) -> None:
+    """Read a damaged file, which is refused, or of which something is left."""
+    with contextlib.suppress(AncillaryError):
+        assert read(path, **given)
+
+
+@each("name", [*TEXTS, "m_ecmwf.nc"])
+def test_damaged_files_are_refused_or_give_what_is_left(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "m_ecmwf.nc":
+        sounding_texts.cloudnet(path, NOON, (0.0, 0.0))
+    else:
+        path.write_text(TEXTS[name](NOON, 0.0))
+    given = {"columns": list(COLUMNS)} if name == "chain.csv" else {}
+    content = path.read_bytes()
+    rng = np.random.default_rng(1)
+    for end in np.linspace(0, len(content) - 1, 40).astype(int):
+        path.write_bytes(content[:end])
+        _attempt(path, **given, **GIVEN)
+        changed = bytearray(content)
+        for place in rng.integers(0, len(content), 5):
+            changed[place] = rng.integers(32, 127)
+        path.write_bytes(changed)
+        _attempt(path, **given, **GIVEN)
 
 
 # Real files
