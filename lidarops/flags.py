@@ -23,6 +23,13 @@ PLACES: Final = 31
 """Places of bits in ``quality_flag``, an int32 that is never negative."""
 
 
+STANDARD_AIR: Final = (
+    "the air is the standard atmosphere, because no source of the campaign holds a profile near"
+    " enough in time and place"
+)
+"""Description of a bit of kinds that need the density of the air."""
+
+
 class Severity(IntEnum):
     """What a raised bit means for the use of the value."""
 

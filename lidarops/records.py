@@ -73,6 +73,8 @@ class Role(StrEnum):
     SIGNAL = "signal"
     DARK = "dark"
     MOLECULAR = "molecular"
+    ATMOSPHERE = "atmosphere"
+    """Of a file of a source of the air, of which one profile may be used."""
     OVERLAP = "overlap"
     LIDAR_RATIO = "lidar_ratio"
     PRODUCT = "product"

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -90,7 +90,7 @@ _POINTS: Final = 4
 _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
-_LARGEST: Final = 100_000_000
+LARGEST: Final = 100_000_000
 """Bytes; largest file that is read, and most that its variables may take in memory."""
 # Not annotated by xarray. Unlike a dataset, it reads nothing of coordinates when it opens a file.
 _STORE: Final[Any] = xr.backends.NetCDF4DataStore
@@ -147,6 +147,8 @@ class Ancillaries:
     lidar_ratios: Mapping[str, LidarRatio]
     inputs: tuple[InputRecord, ...]
     """In order of file names."""
+    folder: Path = field(default=Path(), compare=False)
+    """That of the campaign file."""
 
     @classmethod
     def read(cls, folder: Path, files: Mapping[str, Role]) -> Self:
@@ -168,12 +170,15 @@ class Ancillaries:
         for name, role in sorted(files.items()):
             if role is Role.MOLECULAR:
                 profiles[name], digest = molecular_profile(folder, name)
+            elif role is Role.ATMOSPHERE:
+                # The air of the plan reads the profile that it chose.
+                digest = hashlib.sha256(read_file(folder, name)).hexdigest()
             elif role is Role.LIDAR_RATIO:
                 lidar_ratios[name], digest = lidar_ratio_profile(folder, name)
             else:
                 overlaps[name], digest = overlap_profile(folder, name)
             inputs.append(InputRecord(name, role, digest))
-        return cls(profiles, overlaps, lidar_ratios, tuple(inputs))
+        return cls(profiles, overlaps, lidar_ratios, tuple(inputs), folder)
 
 
 def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
@@ -208,6 +213,12 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
     except RetrievalInputError as error:
         problem, field, remedy = error.problem, error.field, error.remedy
         raise AncillaryError(problem, file=name, field=field, remedy=remedy) from error
+    refuse_wide_levels(profile, name)
+    return profile, digest
+
+
+def refuse_wide_levels(profile: MolecularProfile, name: str) -> None:
+    """Raise AncillaryError where levels below 20 km are so far apart that they are no lines."""
     low = profile.altitude[:-1] < 20_000.0
     widest = float(np.max(np.diff(profile.altitude)[low], initial=0.0))
     if widest > _WIDEST:
@@ -217,7 +228,6 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
             field="altitude",
             remedy=f"give levels at most {_WIDEST:g} m apart",
         )
-    return profile, digest
 
 
 def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
@@ -415,13 +425,14 @@ def _as_resolved(raw: Table) -> Array:
     return resolved
 
 
-def _read(folder: Path, name: str) -> bytes:
+def read_file(folder: Path, name: str) -> bytes:
+    """Return the content of a file; raise AncillaryError where it is none of the campaign."""
     path = folder / name
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
         if inside:
             with opened_regular(path) as stream:
-                if os.fstat(stream.fileno()).st_size <= _LARGEST:
+                if os.fstat(stream.fileno()).st_size <= LARGEST:
                     return stream.read()
     # RuntimeError: a loop of links; ValueError: an invalid file name.
     except (OSError, RuntimeError, ValueError) as error:
@@ -498,9 +509,9 @@ def _columns(table: Table, file: str, names: tuple[str, ...]) -> tuple[Array, ..
 
 def _table(folder: Path, file: str) -> tuple[Table, str]:
     """Return the columns of a file, and its sha256."""
-    content = _read(folder, file)
+    content = read_file(folder, file)
     is_netcdf = file.lower().endswith(".nc")
-    table = _netcdf(folder / file, file) if is_netcdf else _csv(content, file)
+    table = netcdf_table(folder / file, file) if is_netcdf else _csv(content, file)
     return table, hashlib.sha256(content).hexdigest()
 
 
@@ -547,12 +558,13 @@ def _refuse_large(variables: Mapping[str, xr.Variable], file: str) -> None:
         name: one.dtype.itemsize * max(one.size, math.prod(one.encoding.get("chunksizes") or ()))
         for name, one in variables.items()
     }
-    if sum(sizes.values()) > _LARGEST:
+    if sum(sizes.values()) > LARGEST:
         largest = max(sizes, key=lambda name: sizes[name])
         raise AncillaryError("is larger than any profile", file=file, field=largest)
 
 
-def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
+def netcdf_table(path: Path, file: str) -> dict[str, tuple[str, Array]]:
+    """Return the units and values of the numbers of a NetCDF file, in any shape."""
     try:
         with closing(_STORE.open(path)) as store:
             stored, attributes = store.load()

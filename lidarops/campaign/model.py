@@ -24,6 +24,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from lidarops.campaign.atmosphere import AtmosphereSource
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.campaign.yaml_errors import (
     Loader,
@@ -550,6 +551,12 @@ class Campaign(SettingsModel):
     networks: dict[Identifier, Network] = Field(
         default={}, description="instruments whose beams cross, by a key of your choice"
     )
+    atmosphere: dict[Identifier, list[AtmosphereSource]] = Field(
+        default={},
+        description="sources of the air over a station, by its key, in their order: the first one"
+        " with a profile near enough counts, else the US Standard Atmosphere 1976; the"
+        " molecular_profile of the facts counts before them",
+    )
     scenes: Scenes = Scenes()
     periods: list[CampaignPeriod] = Field(
         default=[], description="periods whose products can be frozen"
@@ -589,6 +596,8 @@ class Campaign(SettingsModel):
             _refuse_unknown(
                 "station", instrument.station, self.stations, "instruments", key, "station"
             )
+        for key in self.atmosphere:
+            _refuse_unknown("station", key, self.stations, "atmosphere", key)
         return self
 
     @model_validator(mode="after")

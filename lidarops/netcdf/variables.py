@@ -667,12 +667,28 @@ def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
 
 
 MOLECULAR_SOURCE: Final = coded(
-    "molecular_source",
-    "source of pressure and temperature of the molecular atmosphere",
-    ("standard_atmosphere", "sounding"),
-    "standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or model"
-    " that the campaign gives; provenance names it.",
+    "atmospheric_molecular_calculation_source",
+    "data source of the atmospheric molecular calculations",
+    ("US_standard_atmosphere", "radiosounding", "ecmwf", "icon-iglo-12-23", "gdas"),
+    "As in files of EARLINET. radiosounding: also any file that molecular_profile names."
+    " icon-iglo-12-23: any run of ICON. provenance names the files.",
 )
+_SOURCES: Final = (
+    "Missing where the campaign gives no sources of the air; age and distance also where none of"
+    " them holds."
+)
+MOLECULES: Final = (
+    MOLECULAR_SOURCE,
+    *(
+        per_profile(f"molecular_{name}", words, _SOURCES, dims=(), optional=True, units=units)
+        for name, words, units in (
+            ("profile_age", "time from the middle of the scene to the nearest profile of air", "s"),
+            ("profile_distance", "distance of the farthest profile of air from the station", "m"),
+            ("density_relative_error", "relative standard error of the density of molecules", "1"),
+        )
+    ),
+)
+"""Variables of the air of a scene."""
 BACKGROUND_METHOD: Final = coded(
     "background_method",
     "method by which the background is estimated",

@@ -28,6 +28,7 @@ from lidarops.records import FileNote, Granule, Role, UnusedFile, day_of, digest
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.run.outlying_headers import NEAR_DAYS
 from lidarops.run.scenes import RefusedFile, dated
+from lidarops.scene.air import AirFiles
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 
@@ -85,9 +86,10 @@ class DayStates:
         self.selection = selection or Selection()
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
+        self.air = AirFiles(campaign) if campaign.atmosphere else None
         if known is not None:
             self.base, self.names, self.refused = known.base, known.names, known.refused
-            self.read_by_months = known.read_by_months
+            self.air, self.read_by_months = known.air, known.read_by_months
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
         """Return the state of every day.
@@ -135,6 +137,7 @@ class DayStates:
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
                 [entry.what for entry in self.campaign.acknowledged if entry.holds],
+                self.air and self.air.state,
                 joint_code_version(requested_kinds(self.campaign), *_PLANNING),
                 sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]

@@ -148,6 +148,9 @@ def _unusable_files(
             problem = states.file_problem(path, role)
             if problem:
                 yield UnusableFile(name, key, path, problem)
+        station = states.campaign.instruments[name].station
+        for path, problem in states.air.problems(station).items() if states.air else ():
+            yield UnusableFile(name, "atmosphere", path, problem)
 
 
 def _unmade(

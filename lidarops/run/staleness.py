@@ -421,7 +421,7 @@ class Judge(DayStates):
         return replace(judged, stale=(), failure=failure, held=True)
 
     def _planned(self, scene: Scene, made: Mapping[str, RecordedProduct]) -> Judgement:
-        planned = plan_scene(scene, self.campaign)
+        planned = plan_scene(scene, self.campaign, self.air)
         files = ancillary_files(planned.steps)
         problems = {
             name: problem

@@ -241,14 +241,16 @@ def facts_settings(campaign: Campaign, scene: Scene, plan: Plan, channel: str) -
     }
 
 
-def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
+def ancillary_files(steps: Sequence[PlannedStep]) -> dict[str, Role]:
     """Return the ancillary files that steps read, by path, with their roles."""
-    return {
+    named = {
         path: role
         for step in steps
         for key, role in ANCILLARY_FILES.items()
         if (path := step.settings.get(key)) is not None
     }
+    chosen = (step.settings["atmosphere"] for step in steps if step.settings.get("atmosphere"))
+    return named | {one["file"]: Role.ATMOSPHERE for air in chosen for one in air["profiles"]}
 
 
 def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:

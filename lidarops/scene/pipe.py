@@ -44,6 +44,7 @@ from lidarops.retrieve.signal.dead_time import (
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, ChannelLag, enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
+from lidarops.scene.air import STANDARD_ERROR, AirFiles, ChosenAir
 from lidarops.scene.case import (
     DARK_FILES,
     LAG_STEP,
@@ -441,28 +442,49 @@ def plan_noise(case: ChannelCase[Any]) -> Entry:
     return case.run("noise", reason, settings, needs=needs, number=settings.noise_variance)
 
 
+AIR: Final = "molecular"
+"""Stage that runs once a channel, if one of its products needs it."""
+
+
 class MolecularSettings(SettingsModel):
     """Settings of the stage ``molecular``."""
 
     molecular_profile: str | None = None
-    """Ancillary file of pressure and temperature; None for the US Standard Atmosphere 1976."""
+    """Ancillary file of pressure and temperature that the facts name."""
+    atmosphere: ChosenAir | None = None
+    """Profiles of the first source that holds."""
+    relative_error: float | None = None
+    """Standard error of the density, of sources or of the standard atmosphere that stands for them.
+
+    With neither file nor profiles, the air is that of the US Standard Atmosphere 1976.
+    """
 
 
-def plan_molecular(case: ChannelCase[Any]) -> Entry:
-    """Give the density of the air, of a file or of the standard atmosphere."""
-    source = case.facts.molecular_profile
-    reason = "given by the campaign"
-    if not source:
-        reason = "the campaign gives no molecular_profile; US Standard Atmosphere 1976 is used"
-    return case.run("molecular", reason, MolecularSettings(molecular_profile=source or None))
+def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
+    """Give the density of the air, of a file, of sources or of the standard atmosphere."""
+    if source := case.facts.molecular_profile:
+        settings = MolecularSettings(molecular_profile=source)
+        return case.run(AIR, "given by the campaign", settings)
+    if air is None or not air.is_given(case.scene.station):
+        reason = "the campaign gives neither molecular_profile nor atmosphere; US Standard"
+        return case.run(AIR, f"{reason} Atmosphere 1976 is used", MolecularSettings())
+    chosen = air.of_scene(case.scene)
+    if chosen is not None:
+        reason = "nearest profiles of the first source of the atmosphere that holds"
+        settings = MolecularSettings(atmosphere=chosen[0], relative_error=chosen[1])
+        return case.run(AIR, reason, settings, number=chosen[0].age)
+    warning = (
+        "no source of the atmosphere holds: US Standard Atmosphere 1976 is used, and values of"
+        " elastic and raman have the flag standard_air"
+    )
+    settings = MolecularSettings(relative_error=STANDARD_ERROR)
+    return case.run(AIR, "all sources are too far in time or place", settings, warning=warning)
 
 
 _OF_FILES: Final = (plan_overlap, plan_range_offset, plan_dark, plan_dead_time, plan_noise)
 """From the counts of a channel of the files to its profiles, in the order in which stages run."""
 _OF_GLUED: Final = (plan_overlap, plan_lag, plan_glue)
 """From two channels of the files to the profiles of the glued one."""
-AIR: Final = "molecular"
-"""Stage that runs once a channel, if one of its products needs it."""
 
 
 class Stages(SettingsModel):
@@ -556,5 +578,15 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"
         signal.profiles = glue(stages.glue, signal, estimated=estimated)
     if stages.molecular is not None:
-        file, known = stages.molecular.molecular_profile, source.ancillaries.profiles
-        signal.molecules = MolecularProfile.us_standard() if file is None else known[file]
+        signal.air = stages.molecular.atmosphere
+        signal.air_error = stages.molecular.relative_error
+        signal.molecules = _molecules(stages.molecular, source)
+
+
+def _molecules(settings: MolecularSettings, source: Source) -> MolecularProfile:
+    """Return the air that a plan states."""
+    if settings.atmosphere is not None:
+        return settings.atmosphere.profile(source.ancillaries.folder)
+    if settings.molecular_profile is not None:
+        return source.ancillaries.profiles[settings.molecular_profile]
+    return MolecularProfile.us_standard()

@@ -29,6 +29,7 @@ from lidarops.records import (
     is_glued,
     products_of,
 )
+from lidarops.scene.air import AirFiles
 from lidarops.scene.case import (
     NO_PRODUCT,
     NOT_REQUESTED,
@@ -50,8 +51,15 @@ from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, 
 from lidarops.settings import ChannelProduct
 
 
-def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
+def plan_scene(scene: Scene, campaign: Campaign, air: AirFiles | None = None) -> Plan:
     """Decide what runs for a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    campaign : Campaign
+    air : AirFiles, optional
+        Profiles of the sources of the campaign; by default they are looked up for this scene.
 
     Returns
     -------
@@ -67,7 +75,9 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
             for entry in making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
         )
     elif scene.granules:
-        entries = _entries(scene, campaign)
+        if air is None and campaign.atmosphere:
+            air = AirFiles(campaign)
+        entries = _entries(scene, campaign, air)
     else:
         entries = _month_entries(scene, campaign)
     linked = _linked(list(entries))
@@ -89,7 +99,7 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
     )
 
 
-def _entries(scene: Scene, campaign: Campaign) -> Entries:
+def _entries(scene: Scene, campaign: Campaign, air: AirFiles | None) -> Entries:
     # A scene never spans an edge of a validity period, so the facts of its first granule hold.
     facts = scene_facts(campaign, scene)
     wanted = campaign.instruments[scene.instrument].products.requested
@@ -97,7 +107,7 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
     glued = joined_layout(layout, named_channels(wanted))
     yield from missing_channels(layout, glued, wanted, facts)
     cases = list(_cases(scene, campaign, facts, wanted, layout, glued))
-    entries = [entry for case in cases for entry in _channel_entries(case)]
+    entries = [entry for case in cases for entry in _channel_entries(case, air)]
     yield from entries
     # Those of all channels are decided by now.
     made = _made(entries)
@@ -210,7 +220,7 @@ def _derived_entries(
             yield entry
 
 
-def _channel_entries(case: ChannelCase[Any]) -> list[Entry]:
+def _channel_entries(case: ChannelCase[Any], air: AirFiles | None) -> list[Entry]:
     """Return the entries of a channel: its conditioning, then product by product."""
     stages = plan_stages(case)
     if isinstance(stages[0], LeftOut):
@@ -223,7 +233,7 @@ def _channel_entries(case: ChannelCase[Any]) -> list[Entry]:
         elif not kind.reads:
             products.append(own.leave(kind.name, NOT_REQUESTED, rule=REQUEST))
     needed = any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep))
-    return [*stages, *([plan_molecular(case)] if needed else []), *products]
+    return [*stages, *([plan_molecular(case, air)] if needed else []), *products]
 
 
 def _linked(entries: Sequence[Entry]) -> list[Entry]:

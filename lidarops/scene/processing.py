@@ -52,7 +52,7 @@ from lidarops.scene.case import (
 from lidarops.scene.dependence import ancillary_files, read_products, scene_facts
 from lidarops.scene.input_files import check_files, local_files, open_granules
 from lidarops.scene.job import NO_PLACE, Failure, Job, guarded, nothing_to_do, product_context
-from lidarops.scene.pipe import channel_signal
+from lidarops.scene.pipe import AIR, channel_signal
 from lidarops.scene.profiles import (
     LIGHTLESS,
     ChannelSignal,
@@ -363,6 +363,8 @@ def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> x
     """Return the frame of a product that states what steps decided from the data."""
     parts = counted_channels(context.plan.steps, signal.channel)
     words = [words for part in parts for words in signal.channels[part].statements]
+    if signal.air and signal.air_error and any(step.name == AIR for step in context.plan.steps):
+        words.append(signal.air.words(signal.air_error))
     stated = [frame.attrs["steps"]] if frame.attrs.get("steps") else []
     return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame
 

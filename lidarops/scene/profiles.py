@@ -22,6 +22,7 @@ from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.lag import ChannelLag
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
+from lidarops.scene.air import ChosenAir
 
 Indices = npt.NDArray[np.int64]
 
@@ -290,6 +291,10 @@ class ChannelSignal:
     """Power, variance and quality of the profiles of the channel."""
     molecules: MolecularProfile = field(init=False)
     """The air, of channels with a product that needs it."""
+    air: ChosenAir | None = None
+    """The profiles that it is made of, if the campaign gives sources and one of them holds."""
+    air_error: float | None = None
+    """Relative error of its density; None where the campaign gives no sources."""
     statements: list[str] = field(default_factory=list)
     """What was decided from the data, in words for the product."""
     notes: list[str] = field(default_factory=list)

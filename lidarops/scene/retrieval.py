@@ -22,10 +22,16 @@ import xarray as xr
 from lidarops.campaign.model import Campaign, ChannelFacts, Station
 from lidarops.constants import FIXED, KNOWN_SHAPE_PAPERS, LEAST_SPREAD, STEEPEST
 from lidarops.errors import LidarOpsError
-from lidarops.flags import Quality
+from lidarops.flags import FlagBit, Quality
 from lidarops.kinds import kinds
 from lidarops.netcdf.read import open_product
-from lidarops.netcdf.variables import BACKGROUND_METHOD, MOLECULAR_SOURCE, judging, whole_error
+from lidarops.netcdf.variables import (
+    BACKGROUND_METHOD,
+    MOLECULAR_SOURCE,
+    QUALITY_FLAG,
+    judging,
+    whole_error,
+)
 from lidarops.raw.header import Stretches
 from lidarops.records import ChannelLayout, PlannedStep, Scene, file_channels, is_glued, products_of
 from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
@@ -235,18 +241,37 @@ def settings_model(step: PlannedStep) -> Any:
     return next(m for m in (*get_args(annotation), annotation) if m is not NoneType)
 
 
-def with_methods(product: xr.Dataset, signal: ChannelSignal, *, known_shape: bool) -> xr.Dataset:
-    """Return the product with the source of its air, and method and papers of its backgrounds."""
+def with_methods(
+    product: xr.Dataset, signal: ChannelSignal, standard_air: FlagBit, *, known_shape: bool
+) -> xr.Dataset:
+    """Return the product with its air, and method and papers of its backgrounds.
+
+    Parameters
+    ----------
+    product : xr.Dataset
+    signal : ChannelSignal
+    standard_air : FlagBit
+        Bit of all values where the standard atmosphere stands for the sources of the campaign.
+    known_shape : bool
+        Whether the background is fitted with the shape of the signal of clean air.
+    """
     before = f"{BEFORE}{signal.channel}" in signal.source.archive
     method = "before_pulse" if before else "known_shape" if known_shape else "tail_mean"
     if method == "known_shape":
         product = product.assign_attrs(references=KNOWN_SHAPE_PAPERS)
-    return product.assign(
-        molecular_source=MOLECULAR_SOURCE.code(
-            "standard_atmosphere" if signal.molecules.standard else "sounding"
-        ),
-        background_method=BACKGROUND_METHOD.code(method),
-    )
+    air, states = signal.air, MOLECULAR_SOURCE.states
+    if air is None and signal.air_error is not None:
+        names = [str(name) for name in product if str(name).endswith(QUALITY_FLAG)]
+        product = product.assign({name: product[name] | np.int32(standard_air) for name in names})
+    origin = air.origin if air else states[0 if signal.molecules.standard else 1]
+    stated = {
+        "molecular_profile_age": air.age if air else None,
+        "molecular_profile_distance": air.distance if air else None,
+        "molecular_density_relative_error": signal.air_error,
+        MOLECULAR_SOURCE.name: [state.startswith(origin) for state in states].index(True),
+        "background_method": BACKGROUND_METHOD.code(method),
+    }
+    return product.assign({key: value for key, value in stated.items() if value is not None})
 
 
 def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:

@@ -118,8 +118,11 @@ def test_the_file_states_its_reference_and_the_source_of_the_air(night):
     # Without a sounding, the slope of density is known to 1.6e-5 m-1, of both wavelengths.
     error = product["aerosol_extinction_error_molecular"].values
     assert np.nanmin(error) == pytest.approx(1.6e-5 / 1.9, rel=0.05)
-    sources = product["molecular_source"].attrs["flag_meanings"].split()
-    assert sources[product["molecular_source"].item()] == "standard_atmosphere"
+    sources = product["atmospheric_molecular_calculation_source"].attrs["flag_meanings"].split()
+    assert (
+        sources[product["atmospheric_molecular_calculation_source"].item()]
+        == "US_standard_atmosphere"
+    )
     # The station lies at 500 m, and the beam is vertical.
     altitude = product["reference_bottom_altitude"].values
     np.testing.assert_allclose(altitude, 500.0 + product["reference_bottom"].values, rtol=1e-6)

@@ -117,7 +117,7 @@ def states(product: xr.Dataset, name: str) -> str:
 def test_files_state_methods_reference_and_source_of_the_air(campaign: Campaign):
     opened = {kind: xr.load_dataset(of_kind(campaign, kind)) for kind in KINDS}
     elastic = opened["elastic"]
-    assert states(elastic, "molecular_source") == "sounding"
+    assert states(elastic, "atmospheric_molecular_calculation_source") == "radiosounding"
     assert states(elastic, "background_method") == "known_shape"
     assert states(opened["signal"], "background_method") == "tail_mean"
     assert states(opened["homogeneous"], "retrieval_method") == "direct"

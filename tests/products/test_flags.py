@@ -54,6 +54,7 @@ OWN = {
         "negative_backscatter": 20,
         "unknown_overlap": 21,
         "partly_cloudy": 22,
+        "standard_air": 23,
     },
     "raman": {
         "no_reference": 17,
@@ -64,6 +65,7 @@ OWN = {
         "cloud": 22,
         "doubtful_water_vapour": 23,
         "common_overlap": 24,
+        "standard_air": 25,
     },
     "multiangle": {
         "negative_optical_depth": 19,
@@ -99,8 +101,8 @@ LEFT = {
     "shared": 0,
     "signal": 14,
     "homogeneous": 9,
-    "elastic": 8,
-    "raman": 6,
+    "elastic": 7,
+    "raman": 5,
     "multiangle": 2,
     "visibility": 10,
 }
@@ -146,6 +148,9 @@ SCENES = {
     "test_an_overlap_that_is_not_stated_is_no_cloud",
     "ElasticQuality.PARTLY_CLOUDY": "test_partly_cloudy::"
     "test_a_cirrus_that_ends_before_the_middle_is_stated",
+    "ElasticQuality.STANDARD_AIR": "test_atmosphere::"
+    "test_nights_without_source_are_told_and_flagged",
+    "RamanQuality.STANDARD_AIR": "test_atmosphere::test_nights_without_source_are_told_and_flagged",
     "RamanQuality.NO_REFERENCE": "test_raman_retrieval::"
     "test_particles_everywhere_leave_no_reference",
     "RamanQuality.WEAK_SIGNAL": "test_raman_retrieval::"

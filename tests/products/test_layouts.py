@@ -75,6 +75,14 @@ def test_every_unit_is_valid_and_no_placeholder_is_left(mode: DetectionMode):
 _CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline")
 
 
+_AIR = (
+    "atmospheric_molecular_calculation_source",
+    "molecular_profile_age",
+    "molecular_profile_distance",
+    "molecular_density_relative_error",
+)
+
+
 def test_variables_without_standard_name():
     gluing = {
         *("glue_lag", "glue_lag_standard_error", "glue_slope", "glue_slope_standard_error"),
@@ -109,7 +117,7 @@ def test_variables_without_standard_name():
             "molecular_backscatter",
             "molecular_extinction",
             *reference,
-            "molecular_source",
+            *_AIR,
             "background_method",
             "vertical_resolution",
             "cloud_base_range",
@@ -136,7 +144,7 @@ def test_variables_without_standard_name():
             "overlap_standard_error",
             "molecular_backscatter",
             *reference,
-            "molecular_source",
+            *_AIR,
             "background_method",
             "background",
             "background_standard_error",
@@ -231,7 +239,9 @@ def test_method_codes_are_published_and_keep_their_numbers():
         ),
         **{(kind, "background_method"): background
            for kind in ("signal", "elastic", "raman", "multiangle")},
-        **{(kind, "molecular_source"): ("standard_atmosphere", "sounding")
+        **{(kind, "atmospheric_molecular_calculation_source"): (
+            "US_standard_atmosphere", "radiosounding", "ecmwf", "icon-iglo-12-23", "gdas",
+        )
            for kind in ("elastic", "raman")},
     }  # fmt: skip
 

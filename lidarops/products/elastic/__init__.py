@@ -32,7 +32,12 @@ class ElasticAssumptions(SettingsModel):
         10.0, unit="sr", ge=0, le=100, description="of lidar_ratio"
     )
     molecular_relative_error: float = quantity(
-        0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
+        0.01,
+        unit="1",
+        ge=0,
+        le=1,
+        description="standard error of the density of the air, relative; of atmosphere, that of its"
+        " source and age",
     )
     least_signal_to_noise: float = signal_to_noise_limit()
 

@@ -12,6 +12,7 @@ from lidarops.products.elastic import ElasticAssumptions, ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
+from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
@@ -128,13 +129,14 @@ class _Inversion(ProductStream):
 
     def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
         signal, settings = self._signal, self._settings
+        error = settings.molecular_relative_error if signal.air_error is None else signal.air_error
         inverted = labeled.invert_elastic(
             averages.assign_coords(signal.source.pointing),
             molecules=signal.molecules,
             wavelength=signal.wavelength,
             station_altitude=signal.source.station_altitude,
             lidar_ratio=self._lidar_ratio,
-            molecular_relative_error=settings.molecular_relative_error,
+            molecular_relative_error=error,
             reference=self._reference,
             known_shape=self._known_shape,
             overlap=signal.overlap_at(averages["range"].to_numpy()),
@@ -143,7 +145,8 @@ class _Inversion(ProductStream):
         least = settings.least_signal_to_noise
         flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
         glued = flagged.assign(gluing(averages))
-        return with_methods(glued, signal, known_shape=self._known_shape)
+        bit = ElasticQuality.STANDARD_AIR
+        return with_methods(glued, signal, bit, known_shape=self._known_shape)
 
 
 RETRIEVAL: Final = Retrieval(settings=ElasticPlan, needs=_needs, stream=_Inversion, held=_held)

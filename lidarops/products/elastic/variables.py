@@ -22,7 +22,7 @@ from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
     GLUING,
     MEASURED_SHARES,
-    MOLECULAR_SOURCE,
+    MOLECULES,
     STANDARD_NAME_TABLE,
     SUBTRACTED_BACKGROUND,
     Coverage,
@@ -147,7 +147,7 @@ LAYOUT: Final = Layout(
             units="m",
             coverage=Coverage.AUXILIARY,
         ),
-        MOLECULAR_SOURCE,
+        *MOLECULES,
         MOLECULAR_BACKSCATTER,
         Row(
             "molecular_extinction",

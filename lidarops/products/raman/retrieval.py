@@ -14,6 +14,7 @@ from lidarops.products.raman import RamanProduct
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import file_channels
 from lidarops.retrieve.raman import labeled
+from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     WATER_SHIFT,
@@ -23,6 +24,7 @@ from lidarops.retrieve.raman.scattering import (
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
+from lidarops.scene.air import SLOPE
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
 from lidarops.scene.profiles import Averages, ChannelSignal, Chunk, ProductStream
 from lidarops.scene.retrieval import (
@@ -164,6 +166,13 @@ class _Retrieval(ProductStream):
 
     def __init__(self, settings: RamanPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.raman, signal
+        if (error := signal.air_error) is not None:
+            slope = settings.raman.molecular_slope_error
+            changes = {
+                "molecular_relative_error": error,
+                "molecular_slope_error": SLOPE * error if slope is None else slope,
+            }
+            self._settings = settings.raman.model_copy(update=changes)
         names = [signal.channel, *settings.raman.channels]
         highest = settings.raman.reference.highest * settings.raman.stretch
         self._averages = Averages(
@@ -195,7 +204,8 @@ class _Retrieval(ProductStream):
         )
         weighed = [name for name in LAYOUT.weighed if name in retrieved]
         flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
-        return with_methods(flagged, signal, known_shape=settings.known_shape)
+        bit = RamanQuality.STANDARD_AIR
+        return with_methods(flagged, signal, bit, known_shape=settings.known_shape)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings

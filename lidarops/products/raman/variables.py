@@ -21,7 +21,7 @@ from lidarops.netcdf.quantities import (
 from lidarops.netcdf.variables import (
     ALONG_BEAM,
     BACKGROUND_METHOD,
-    MOLECULAR_SOURCE,
+    MOLECULES,
     SUBTRACTED_BACKGROUND,
     Coverage,
     Error,
@@ -185,7 +185,7 @@ LAYOUT: Final = Layout(
             uncertain=True,
             error_kind=ErrorKind.BOTH,
         ),
-        MOLECULAR_SOURCE,
+        *MOLECULES,
         MOLECULAR_BACKSCATTER,
         *reference_window(
             "The elastic signal is corrected for the measured attenuation before it is compared"

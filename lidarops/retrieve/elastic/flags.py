@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import FIRST_OWN, FlagBit, care, reject
+from lidarops.flags import FIRST_OWN, STANDARD_AIR, FlagBit, care, reject
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 
 _MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
@@ -42,3 +42,4 @@ class ElasticQuality(FlagBit):
         f"some of the averaged profiles, not all, show a cloud within {_MARGIN}, or between"
         " here and the start of the inversion: the mean is that of cloudy and clear air",
     )
+    STANDARD_AIR = care(FIRST_OWN + 6, STANDARD_AIR)

@@ -40,7 +40,6 @@ _DIMENSIONS: Final = {
 _OF_CELLS: Final = {name for name, dims in _DIMENSIONS.items() if dims == _CUBE}
 BATCH: Final = 64
 """Profiles averaged together, unless one cycle has more."""
-_LEVELS: Final = ("altitude", "pressure", "temperature")
 _FEW: Final = 16
 """Profiles whose bins are prepared together, so that they stay in the cache of the processor; the
 result does not depend on it."""
@@ -63,7 +62,9 @@ class BeamAir(NamedTuple):
             raise RetrievalInputError(
                 f"is {self.wavelength}", field="wavelength", remedy="give m, or leave the air out"
             )
-        arrays = (zenith_angle, distance, *(getattr(self.molecules, name) for name in _LEVELS))
+        air = self.molecules
+        levels = (air.altitude, air.pressure, air.temperature, air.water_vapour)
+        arrays = [zenith_angle, distance, *(level for level in levels if level is not None)]
         key = (self.wavelength, station_altitude, *(array.tobytes() for array in arrays))
         if key not in self.kept:
             in_front = distance > 0
@@ -72,7 +73,7 @@ class BeamAir(NamedTuple):
             climb = np.cos(np.radians(angles))[:, np.newaxis]
             altitude = station_altitude + climb * distance[in_front]
             shapes = np.zeros((angles.size, distance.size))
-            extinction = self.molecules.extinction(altitude, self.wavelength)
+            extinction = air.extinction(altitude, self.wavelength)
             backscatter = extinction / molecular_lidar_ratio(self.wavelength)
             shapes[:, in_front] = known_shape.molecular_shape(
                 backscatter, extinction, distance[in_front]

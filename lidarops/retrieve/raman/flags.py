@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.flags import FIRST_OWN, FlagBit, Quality, care, reject
+from lidarops.flags import FIRST_OWN, STANDARD_AIR, FlagBit, Quality, care, reject
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common.arrays import Flags
 
@@ -37,7 +37,7 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 3,
         "beyond, the Raman signal falls less than in air without particles, by more than its"
         " error: the overlap may not be full where stated, a background is wrong, or the air is"
-        " not that of molecular_source",
+        " not that of atmospheric_molecular_calculation_source",
     )
     PARTLY_CLOUDY = care(
         FIRST_OWN + 4,
@@ -61,6 +61,7 @@ class RamanQuality(FlagBit):
         "the overlap is not full: the value holds where both channels have the same overlap,"
         " which its error does not cover",
     )
+    STANDARD_AIR = care(FIRST_OWN + 8, STANDARD_AIR)
 
 
 _OF_SIGNALS: Final = (
@@ -75,6 +76,7 @@ _OF_SIGNALS: Final = (
     RamanQuality.WEAK_SIGNAL,
     RamanQuality.PARTLY_CLOUDY,
     RamanQuality.CLOUD,
+    RamanQuality.STANDARD_AIR,
 )
 _OF_SLOPE: Final = (Quality.INCOMPLETE_OVERLAP, RamanQuality.NEGATIVE_EXTINCTION)
 CONCERNING: Final[Mapping[str, tuple[FlagBit, ...]]] = MappingProxyType(

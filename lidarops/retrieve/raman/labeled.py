@@ -327,7 +327,8 @@ def _air(
 ) -> AirColumn:
     laser, raman = wavelengths
     altitude, stretch = station_altitude + climb * distance, 1.0 / climb
-    density = molecules.number_density(altitude)
+    # Nitrogen is a share of dry air.
+    density = molecules.dry_density(altitude)
     if settings.filter_width is not None:
         temperature = molecules.at(altitude)[1]
         density = density * nitrogen_line_share(temperature, laser, raman, settings.filter_width)
@@ -467,7 +468,7 @@ def _water(
 ) -> tuple[dict[str, Any], Booleans]:
     """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
     air, cells, settings = beam.air, beam.cells, beam.settings
-    density = beam.molecules.number_density(beam.altitude)
+    density = beam.molecules.dry_density(beam.altitude)
     depth = _depth(beam.molecules, beam.altitude, air.range, water.wavelength)
     # The share of the lines of nitrogen that the filter passes is not that of water vapour.
     shape = replace(air, raman_depth=depth, density=density)

@@ -47,7 +47,11 @@ class RamanSettings:
     molecular_relative_error: Annotated[
         float,
         quantity(
-            unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
+            unit="1",
+            ge=0,
+            le=1,
+            description="standard error of the density of the air, relative; of atmosphere, that of"
+            " its source and age",
         ),
     ] = 0.01
     molecular_slope_error: Annotated[
@@ -58,7 +62,7 @@ class RamanSettings:
             le=1e-3,
             description="standard error of the derivative of the logarithm of the density of the"
             " air over height; by default 1.6e-5 of the standard atmosphere, 2e-6 of a"
-            " molecular_profile",
+            " molecular_profile, that of source and age of atmosphere",
         ),
     ] = None
     overlap_relative_error: Annotated[

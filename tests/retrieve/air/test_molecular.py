@@ -9,11 +9,14 @@ from support.cases import each
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import (
     HIGHEST,
+    VAPOUR_SCATTERING,
     MolecularProfile,
+    altitude_of,
     molecular_lidar_ratio,
     number_density,
     rayleigh_cross_section,
     us_standard,
+    vapour_share,
 )
 
 STANDARD = MolecularProfile.us_standard()
@@ -193,3 +196,59 @@ def test_a_profile_does_not_change_with_its_input():
     assert profile.number_density(5e3) == before
     with pytest.raises(ValueError, match="read-only"):
         profile.temperature[0] = 1.0
+
+
+@each("wavelength", [355e-9, 532e-9, 1064e-9])
+def test_water_vapour_scatters_as_its_refractivity_says(wavelength):
+    """`ciddor1996`, equation 3, at 20 degC and 1333 Pa; its King factor is 1."""
+    s2 = (wavelength * 1e6) ** -2
+    of_vapour = 1.022e-8 * (295.235 + 2.6422 * s2 - 0.03238 * s2**2 + 0.004028 * s2**3)
+    own = of_vapour / number_density(1333.0, 293.15)
+    cross_section = 8.0 * np.pi**3 / 3.0 * (2.0 * own) ** 2 / wavelength**4
+    ratio = cross_section / rayleigh_cross_section(wavelength)
+    assert ratio == pytest.approx(VAPOUR_SCATTERING, abs=0.02)
+
+
+def test_humid_air_scatters_less_and_holds_less_nitrogen():
+    dry, humid = _profile(), _profile(water_vapour=np.array([0.03, 0.02, 0.01, 0, 0, 0, 0]))
+    z = np.array([0.0, 100.0, 1150.0, 20_000.0])
+    share = np.array([0.03, 0.03, 0.015, 0.0])
+    np.testing.assert_allclose(humid.vapour(z), share)
+    np.testing.assert_array_equal(humid.number_density(z), dry.number_density(z))
+    np.testing.assert_allclose(humid.dry_density(z), dry.number_density(z) * (1.0 - share))
+    ratio = humid.extinction(z, 532e-9) / dry.extinction(z, 532e-9)
+    np.testing.assert_allclose(ratio, 1.0 - 0.29 * share)
+
+
+@pytest.mark.parametrize(
+    "humidity",
+    [
+        {"dew_point": np.array([293.15])},
+        {"relative_humidity": np.array([0.7379])},
+        {"mixing_ratio": np.array([0.01472])},
+        {"specific_humidity": np.array([0.01451])},
+    ],
+)
+def test_humidities_mean_one_mole_fraction(humidity):
+    """2339 Pa of water at 20 degC, in air of 298.15 K: tables of the WMO."""
+    share = vapour_share(np.array([101_325.0]), np.array([298.15]), **humidity)
+    assert share[0] == pytest.approx(2339.0 / 101_325.0, rel=4e-3)
+
+
+def test_geopotential_height_of_the_standard_at_its_latitude():
+    """Of `us1976` gravity is 9.80665 m s-2, that of 45.5 degrees: 11 km are 11019 m."""
+    assert altitude_of(11_000.0, 45.5) == pytest.approx(11_019.1, abs=1.0)
+    assert altitude_of(11_000.0, 0.0) - altitude_of(11_000.0, 90.0) == pytest.approx(58.0, abs=3.0)
+
+
+def test_air_between_two_times_is_a_geometric_mean_of_pressures():
+    first, second = _profile(), MolecularProfile.us_standard()
+    z = np.linspace(100.0, 12_000.0, 57)
+    mixed = first.mixed(second, 0.25)
+    pressures, temperatures = zip(first.at(z), second.at(z), strict=True)
+    pressure, temperature = mixed.at(z)
+    expected = pressures[0] ** 0.75 * pressures[1] ** 0.25
+    np.testing.assert_allclose(pressure, expected, rtol=1e-5)
+    expected = 0.75 * temperatures[0] + 0.25 * temperatures[1]
+    np.testing.assert_allclose(temperature, expected, atol=0.05)
+    assert not mixed.standard
