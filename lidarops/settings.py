@@ -171,7 +171,7 @@ Patterns = Annotated[
     ),
     AfterValidator(_words),
 ]
-"""Patterns of paths below the archive, as of a shell; `raw_files.path_pattern` reads each."""
+"""Patterns of paths below the archive, as of a shell; `campaign.path_patterns` reads each."""
 Identifier = Annotated[
     str,
     Field(

@@ -601,7 +601,7 @@ def _levels(height: Array, pressure: Array, temperature: Array, share: Array) ->
     Levels without height lie where the hydrostatic equation puts them between their neighbours.
     Humidity is 0 above the last level that states it.
     """
-    known = np.isfinite(pressure) & np.isfinite(temperature)
+    known = (pressure > 0.0) & np.isfinite(pressure) & np.isfinite(temperature)
     order = np.flatnonzero(known)[np.argsort(-pressure[known], kind="stable")]
     order = order[np.diff(pressure[order], prepend=np.inf) < 0.0]
     z, p, t, x = (values[order] for values in (height, pressure, temperature, share))

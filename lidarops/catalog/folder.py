@@ -14,11 +14,10 @@ from operator import itemgetter
 from statistics import median
 from typing import Final
 
+from lidarops.campaign.path_patterns import literal_pattern, path_pattern
 from lidarops.catalog.raw_files import (
     HEADER_BYTES,
     Source,
-    literal_pattern,
-    path_pattern,
     printable,
 )
 from lidarops.constants import FIXED, STEEPEST

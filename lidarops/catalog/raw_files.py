@@ -6,11 +6,9 @@ processes that read headers load them, so they import little, and no database.
 
 from __future__ import annotations
 
-import fnmatch
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime, timedelta
@@ -18,6 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from lidarops.campaign.path_patterns import path_matcher
 from lidarops.errors import RawFormatError, UnavailableError
 from lidarops.raw.formats import parse_raw_header, read_start, time_in_path
 from lidarops.raw.header import TIME_REMEDY, RawHeader
@@ -85,34 +84,6 @@ def acknowledged_reasons(campaign: Campaign, reasons: Mapping[str, str]) -> dict
         path: next((words for matches, words in entries if matches(path)), "") + reason
         for path, reason in reasons.items()
     }
-
-
-def path_matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
-    """Return a function that tells whether a path matches one of some patterns."""
-    expressions = [path_pattern(pattern) for pattern in patterns]
-    return lambda path: any(expression.match(path) for expression in expressions)
-
-
-def path_pattern(pattern: str) -> re.Pattern[str]:
-    """Return the expression of a pattern of paths: that of a shell, whose ** stands for folders."""
-    expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-    tokens = re.split(r"(\*\*/|\*\*|\*|\?|\[[!^]?\]?[^]/]*\])", pattern)
-    expression = "".join(
-        expressions.get(token) or (_choice(token) if number % 2 else re.escape(token))
-        for number, token in enumerate(tokens)
-    )
-    return re.compile(expression + r"\Z")
-
-
-def _choice(brackets: str) -> str:
-    """Return the expression of characters in brackets, such as [67], [a-f], [!0]."""
-    translated = fnmatch.translate(re.sub(r"^\[\^", "[!", brackets))
-    return "(?!/)" + translated.removeprefix("(?s:")[: -len(r")\Z")]
-
-
-def literal_pattern(path: str) -> str:
-    """Return the pattern that matches one path only, whatever characters it holds."""
-    return re.sub(r"[*?\[{]", r"[\g<0>]", path)
 
 
 class Source:

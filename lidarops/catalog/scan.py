@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
+from lidarops.campaign.path_patterns import path_pattern
 from lidarops.catalog.granules import DatedFile, Fingerprint, misdated
 from lidarops.catalog.raw_files import (
     GranuleRow,
@@ -22,7 +23,6 @@ from lidarops.catalog.raw_files import (
     Source,
     UnreadFile,
     acknowledged_reasons,
-    path_pattern,
     printable,
     read_row,
     unread_row,

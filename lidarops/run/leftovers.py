@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.raw_files import path_matcher
+from lidarops.campaign.path_patterns import path_matcher
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import product_path
 from lidarops.records import (

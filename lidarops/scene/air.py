@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from lidarops.campaign.atmosphere import AtmosphereReading, AtmosphereSource
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.raw_files import path_matcher
+from lidarops.campaign.path_patterns import path_matcher
 from lidarops.errors import AncillaryError
 from lidarops.records import Scene, digest
 from lidarops.settings import Instant, SettingsModel, quantity

@@ -61,6 +61,7 @@ def assert_like_products(root: Path, kind: str = KIND) -> None:
 
 
 # Variables of elastic and Raman products have the same types and dimensions.
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in MAKERS if kind != "elastic"])
 def test_a_store_that_grew_has_the_bits_and_attributes_of_the_products(kind: str, tmp_path: Path):
     for day in range(2):
@@ -86,6 +87,7 @@ def test_products_of_unequal_length_may_come_in_any_order(tmp_path: Path):
         assert_like_products(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bins", "rows"), [(1000, 256), (10000, 26)])
 def test_chunks_are_long_whatever_the_first_product_but_within_a_mebibyte(
     bins: int, rows: int, tmp_path: Path
@@ -183,6 +185,7 @@ def test_groups_that_are_not_selected_stay(tmp_path: Path):
     assert open_products(store, station="coast").sizes["time"] == 5
 
 
+@pytest.mark.slow
 def test_a_killed_update_leaves_the_snapshot_before_and_the_next_one_completes(tmp_path: Path):
     add_day(tmp_path, 0, KIND)
     before = update(tmp_path)

@@ -18,20 +18,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_072,
-    "lines of code alone": 45_069,
-    "modules": 266,
-    "dataclasses": 219,
-    "lines of dataclasses": 6_083,
+    "lines": 70_907,
+    "lines of code alone": 46_394,
+    "modules": 270,
+    "dataclasses": 220,
+    "lines of dataclasses": 6_190,
     "tuning numbers": 164,
     "tuning numbers that are assumed": 44,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_902,
+    "lines of the largest package": 5_978,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 60, "functions": 582, "changes": 243},
-    "elastic": {"modules": 70, "functions": 714, "changes": 253},
+    "elastic": {"modules": 70, "functions": 717, "changes": 253},
 }
 
 

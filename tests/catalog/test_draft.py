@@ -306,6 +306,7 @@ def test_files_of_real_archives_are_those_of_their_headers(
         assert "molecular_profile; copy them below the folder of this file first" in text
 
 
+@pytest.mark.slow
 def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path: Path) -> None:
     """Without dead time, `poor_stratification` rejects all its cycles."""
     _, text = drafted(data_root / "savant", tmp_path / "campaign.yaml")

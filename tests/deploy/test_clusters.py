@@ -111,6 +111,7 @@ def where() -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("OMP_NUM_THREADS")
 
 
+@pytest.mark.slow
 def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
     chosen = clusters.Local(workers=2, memory="600MiB")
     with clusters.connect_client(chosen) as client:

@@ -165,6 +165,7 @@ def run(command: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 PAGES = sorted({block.page for block in OURS if block.language == "sh"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_shell_blocks_run(page: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for block in OURS:

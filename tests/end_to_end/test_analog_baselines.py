@@ -94,6 +94,7 @@ def test_scans_without_a_blocked_beam(tmp_path, monkeypatch):
     assert false <= 0.005 * count
 
 
+@pytest.mark.slow
 def test_scans_with_a_blocked_beam_stay_usable(tmp_path, monkeypatch):
     known = []
     for number, baseline in enumerate((None, *BASELINES.values())):

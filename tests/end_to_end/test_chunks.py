@@ -63,6 +63,7 @@ def digests(jobs: list[Job]) -> dict[str, str]:
     return {product.path: product.sha256 for job in jobs for product in process_scene(job).products}
 
 
+@pytest.mark.slow
 def test_any_number_of_profiles_together_gives_the_same_bits(
     jobs: list[Job], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,6 +78,7 @@ def test_any_number_of_profiles_together_gives_the_same_bits(
         assert digests([replace(job, profiles_per_chunk=profiles) for job in jobs]) == whole
 
 
+@pytest.mark.slow
 def test_a_scene_loads_no_planning_and_no_scheduler(jobs: list[Job], tmp_path: Path) -> None:
     """A job holds all decisions, so that none is made again where it is carried out.
 

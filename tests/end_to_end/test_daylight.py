@@ -135,6 +135,7 @@ def test_cycles_of_night_and_day_are_not_mixed_in_scale(products) -> None:
         assert np.sqrt(np.nanmean(score[rows] ** 2)) < 1.5
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_what_is_glued(
     jobs: list[Job], written: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -89,6 +89,7 @@ def granules(campaign: Campaign, status: Status = Status.GOOD) -> dict[str, Gran
         return {granule.path: granule for granule in store.granules(status=status)}
 
 
+@pytest.mark.slow
 def test_the_catalog_knows_the_format_of_every_file(licel: Campaign, text: Campaign) -> None:
     by_format = {"licel": granules(licel), "csv": granules(text)}
     assert by_format["licel"].keys() == by_format["csv"].keys()

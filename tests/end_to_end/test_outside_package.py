@@ -210,6 +210,7 @@ def test_products_are_verified_and_reproduced(campaign: Campaign) -> None:
         assert "identical in every byte" in run("reproduce", product)
 
 
+@pytest.mark.slow
 def test_products_are_indexed_joined_and_averaged(copied: Campaign) -> None:
     run("aggregate", copied.output, "--means", "day", "--stac", "--store")
     folder = Path(copied.output) / "aggregates"
@@ -349,6 +350,7 @@ def without_the_package(*commands: list[Any]) -> list[tuple[int, str, str]]:
     return [tuple(result) for result in json.loads(output.splitlines()[-1])]
 
 
+@pytest.mark.slow
 def test_products_of_an_uninstalled_package_are_shown(copied: Campaign) -> None:
     run("aggregate", copied.output)
     file, output = file_of(copied), Path(copied.output)

@@ -266,6 +266,7 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     assert found["vertical_optical_depth"].values[:, row] == pytest.approx([0.12, 0.12], abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("overlap", "method"), [(100, "auto"), (300, "kano_hamilton")])
 def test_what_a_run_knows_to_be_wrong_is_not_good(overlap, method, data_root, tmp_path):
     """Analog signals nearer than their full overlap, and altitudes that are not smoothed."""

@@ -99,6 +99,7 @@ def test_a_telescope_that_is_off_leaves_its_name_free(archive: RecorderArchive) 
     assert "lidarops_polarisation" in xr.open_dataset(paths[0], decode_times=False).attrs
 
 
+@pytest.mark.slow
 def test_names_do_not_depend_on_the_order_in_which_files_come(tmp_path: Path) -> None:
     contents = []
     for number, late in enumerate(("h0", "h11", "")):
@@ -151,6 +152,7 @@ def test_names_stay_when_a_recorder_comes(archive: RecorderArchive) -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True])
 @pytest.mark.parametrize("recorder", ["BT5", None])
 def test_files_that_are_lost_for_a_time_change_nothing(
@@ -303,6 +305,7 @@ def test_files_are_opened_and_described_by_the_same_names(archive: RecorderArchi
     }
 
 
+@pytest.mark.slow
 def test_a_real_lidar_whose_far_telescope_is_off(data_root: Path, tmp_path: Path) -> None:
     case = data_root / "cases" / "telescope_off" / "raw"
     if not case.is_dir():

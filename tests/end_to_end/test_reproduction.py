@@ -138,6 +138,7 @@ def test_files_state_methods_reference_and_source_of_the_air(campaign: Campaign)
     assert error == pytest.approx(ratio * assumed.relative_error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
 def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path):
     loaded, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))

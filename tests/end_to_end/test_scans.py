@@ -248,6 +248,7 @@ def test_two_channels_that_disagree_are_both_to_be_used_with_care(polarised):
         assert "one of the two is wrong" in product.attrs["lidarops_steps"]
 
 
+@pytest.mark.slow
 def test_verdicts_on_channels_are_the_same_whatever_is_made_with_them(polarised):
     settings = of_channels(polarised, "alone", range_offset=40.0)
     reprocess(settings)

@@ -152,6 +152,7 @@ def test_the_stated_retrieval_is_the_one_that_ran(
         assert f'"method":"{method}"' in product["provenance"].item().replace("\\", "")
 
 
+@pytest.mark.slow
 @each(
     ("kind", "settings", "method"),
     [

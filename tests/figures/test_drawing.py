@@ -55,6 +55,7 @@ def every_layer() -> Figure:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "begin"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")]
 )
@@ -113,6 +114,7 @@ def test_an_axis_that_is_not_finite_is_no_json():
         browser.inline(Figure("c", "w", (panel,)))
 
 
+@pytest.mark.slow
 def test_drawing_libraries_are_imported_only_where_something_is_drawn():
     code = (
         "import lidarops.site.build, lidarops.reports.run_page, lidarops.cli.app, sys;"

@@ -52,6 +52,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MAKERS)
 def test_every_variable_of_every_kind_is_read_as_by_xarray(kind: str, tmp_path: Path):
     path = tmp_path / "product.nc"
@@ -100,6 +101,7 @@ KEYS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
 @given(time=KEYS, bins=st.one_of(st.integers(0, 1999), slices(2000)))
 def test_any_slice_equals_that_slice_of_the_whole(chunked: Path, time: object, bins: object):

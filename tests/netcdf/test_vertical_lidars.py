@@ -14,8 +14,8 @@ from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
 from lidarops import open_products
-from lidarops.aggregate.facts import Period
-from lidarops.aggregate.means import write_means
+from lidarops.aggregate.facts import Period, groups
+from lidarops.aggregate.means import Means
 from lidarops.netcdf import product_file
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.read import open_product
@@ -119,7 +119,9 @@ def test_products_of_both_versions_are_one_series(tmp_path: Path, former: pytest
 def test_means_lie_along_altitude(tmp_path: Path):
     for day in range(2):
         add_day(tmp_path, day, "elastic")
-    (file,) = write_means(tmp_path, facts_of(tmp_path), Period.MONTH).files
+    grouped = groups(facts_of(tmp_path))
+    (group,) = grouped
+    (file,) = Means(tmp_path, grouped, Period.MONTH).of(group).files
     with xr.open_dataset(tmp_path / file.path) as means, open_products(tmp_path) as days:
         assert means["aerosol_backscatter"].dims == ("time", "altitude")
         assert "altitude: mean" in means["aerosol_backscatter"].attrs["cell_methods"]

@@ -261,6 +261,7 @@ print(*digests(Path(sys.argv[1])))
 """
 
 
+@pytest.mark.slow
 def test_bytes_are_equal_in_any_process_at_any_time(tmp_path: Path):
     # MALLOC_PERTURB_ shows memory that goes into the file without having been set.
     other = {"PYTHONHASHSEED": "1", "TZ": "Asia/Tokyo", "MALLOC_PERTURB_": "85"}
@@ -294,6 +295,7 @@ with ThreadPoolExecutor(4) as pool:
 """
 
 
+@pytest.mark.slow
 def test_threads_may_write_at_once_and_read_under_the_lock(tmp_path: Path):
     done = run(THREADS, str(tmp_path))
     assert done.returncode == 0, done.stderr[-2000:]
@@ -342,6 +344,7 @@ writer.write_product(build_product(homogeneous(), context()), sys.argv[1])
 """
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_no_product(tmp_path: Path):
     done = run(KILLED, str(tmp_path / "product.nc"))
     assert done.returncode == -signals.SIGKILL
@@ -366,6 +369,7 @@ for room in (100, 10_000, 100_000, 1_000_000, resource.RLIM_INFINITY):
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
     path = tmp_path / "product.nc"
     done = run(FULL, str(path))

@@ -149,6 +149,7 @@ def test_originals_are_accepted(tmp_path, originals, measured):
     assert all(survives(tmp_path / "file", content) for content in originals)
 
 
+@pytest.mark.slow
 def test_mutants_are_read_or_refused(tmp_path, originals):
     rng = random.Random(20241002)
     path = tmp_path / "file"

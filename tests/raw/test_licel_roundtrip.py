@@ -29,6 +29,7 @@ ON_DISK = settings(
 )
 
 
+@pytest.mark.slow
 @given(files(headers(MIXED)))
 def test_bytes_are_read_back(file):
     header, counts = file

@@ -20,6 +20,7 @@ from lidarops.netcdf.write import write_product
 from lidarops.reports.plotting import Selection, draw_file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_products_of_every_kind_are_drawn(kind: str, tmp_path: Path):
     path = tmp_path / "product.nc"

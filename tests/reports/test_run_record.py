@@ -147,6 +147,7 @@ records = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(record=records)
 @settings(
     max_examples=100,

@@ -163,6 +163,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return crash_archive.products(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "after"), [("fsync", 3), ("replace", 2), ("fsync", 0)])
 def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, str], name: str, after: int

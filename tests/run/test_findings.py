@@ -58,6 +58,7 @@ def _elsewhere(archive: Archive) -> None:
     raw_archives.write(archive.folder / "raw/poor/h-foreign", data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [

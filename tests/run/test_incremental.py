@@ -327,6 +327,7 @@ def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
         assert "requested: homogeneous, elastic, signal" in refused.stderr
 
 
+@pytest.mark.slow
 def test_products_that_were_never_made_are_not_fresh(archive: Archive, tmp_path: Path) -> None:
     archive.write()
     for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
@@ -515,6 +516,7 @@ def test_replaced_versions_are_kept_if_the_campaign_says_so(archive: Archive) ->
     assert archive.contents("out/superseded") == kept
 
 
+@pytest.mark.slow
 def test_a_version_that_a_killed_run_kept_is_not_mistaken_for_the_one_that_it_wrote(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

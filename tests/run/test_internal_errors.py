@@ -44,6 +44,7 @@ def _made_in(record: RunRecord) -> set[str]:
     return {scene.scene for scene in record.scenes if scene.products and not scene.error}
 
 
+@pytest.mark.slow
 def test_a_bug_ends_its_scene_only_and_its_traceback_is_kept(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,6 +254,7 @@ def _no_folder(archive: Archive) -> None:
     (archive.folder / "out/products").write_text("a file where a folder should be")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage", [_cut, _blank, _shift, _no_sounding, _no_overlap, _no_folder]
 )  # fmt: skip

@@ -436,7 +436,7 @@ def _stopped(*_: object, **__: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("fails", "code"), [(_full, 1), (_stopped, 130)])
+@pytest.mark.parametrize(("fails", "code"), [(_full, 3), (_stopped, 130)])
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
     archive: Archive,
@@ -507,7 +507,7 @@ def test_a_run_whose_record_could_not_be_saved_is_reported_without_making_it_aga
     with monkeypatch.context() as patch:
         patch.setattr(run_record, "write_atomically", _full)
         failed = CliRunner().invoke(app, command)
-    assert failed.exit_code == 1
+    assert failed.exit_code == 3
     assert "of poor: 1 product" in failed.stdout
     (folder,) = (archive.folder / "out/report").glob("*")
     assert f"lidarops report {folder}" in failed.stderr

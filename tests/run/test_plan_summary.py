@@ -81,6 +81,7 @@ def test_all_shows_settings_and_reasons(campaign: Path) -> None:
         assert expected not in short
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly")
 def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
     archive = Archive(tmp_path, days=25)
@@ -183,6 +184,7 @@ def without_usable_values(job: Job) -> tuple[SceneOutcome, bool]:
     return replace(outcome, products=products), counted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 160])
 @pytest.mark.parametrize("days", [24, pytest.param(330, marks=pytest.mark.slow)])
 def test_scenes_that_all_differ_fill_a_screen_or_two(

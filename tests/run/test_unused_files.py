@@ -132,6 +132,7 @@ def _disturbed(folder: Path, fault: Fault) -> Iterator[None]:
 UNREADABLE = "poor/h01: cannot be read"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "remote", "words"),
     [
@@ -230,6 +231,7 @@ def test_a_product_states_dark_files_only_if_it_subtracts_some(tmp_path: Path) -
     assert not any(text for name, text in stated.items() if "_poor_" in name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["h0640", "h0700"])
 @pytest.mark.parametrize("was_good", [True, False])
 def test_a_file_of_known_start_belongs_to_its_scene_whatever_its_name(
@@ -300,6 +302,7 @@ def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
     ) == MOST_IN_DOUBT * len(days)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("good", "cut", "days"),
     [

@@ -127,6 +127,7 @@ def test_no_mean_holds_them_and_each_counts_them(products):
         np.testing.assert_allclose(attenuated / attenuated[0], 1.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_chunks_and_a_limit_of_memory_change_nothing(products, case, tmp_path):
     for number, options in enumerate(({"profiles_per_chunk": 7}, {"memory": "600MB"})):
         _, again, _ = made(tmp_path / str(number), case / "raw", **options)
@@ -280,6 +281,7 @@ REAL = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", REAL)
 def test_no_real_profile_of_a_laser_that_was_on_is_without_light(data_root, files):
     paths = sorted(data_root.glob(files))

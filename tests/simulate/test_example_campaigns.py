@@ -60,6 +60,7 @@ def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
             assert slant * math.cos(math.radians(angle)) == pytest.approx(vertical, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_network_shares_one_atmosphere(repository, tmp_path):
     campaign = _short(repository, tmp_path, "network")
     result = simulate_campaign(campaign)

@@ -222,6 +222,7 @@ def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
     assert (index.parent / catalog).is_file()
 
 
+@pytest.mark.slow
 def test_a_published_site_links_catalog_and_report_where_they_are(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, "signal")

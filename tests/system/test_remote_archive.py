@@ -324,6 +324,7 @@ def _claimed(archive: str, files: str | list[str], output: Path) -> list[str]:
         return sorted(unquote(granule.path) for granule in catalog.granules())
 
 
+@pytest.mark.slow
 def test_patterns_are_those_of_a_shell_in_each_store(archive: str, tmp_path: Path) -> None:
     for number, (pattern, names) in enumerate(PATTERNS.items()):
         assert _claimed(archive, pattern, tmp_path / f"out{number}") == names, pattern

@@ -56,6 +56,7 @@ def test_bins_beyond_a_thick_layer_of_uncertain_lidar_ratio_are_withheld():
     assert result.unstable[RANGE > 5.1e3].all()
 
 
+@pytest.mark.slow
 def test_errors_hold_where_the_reference_is_noisy():
     """A reference that is too high by noise makes values and their first-order errors too low."""
     r = RANGE[::5]

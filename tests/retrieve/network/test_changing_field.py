@@ -176,6 +176,7 @@ def test_noise_alone_is_no_change():
     assert found <= 2
 
 
+@pytest.mark.slow
 def test_the_field_does_not_depend_on_the_direction_of_time():
     rng = np.random.default_rng(7)
     normal, side = informed(rng, 12, missing=3)

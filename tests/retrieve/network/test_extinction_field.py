@@ -121,6 +121,7 @@ def test_exponent_may_differ_from_beam_to_beam():
 # With noise ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "relative", "bound", "exact"),
     [("homogeneous", 0.10, 0.08, 0.3), ("plume", 0.05, 0.08, 0.1), ("gradient", 0.05, 0.08, 0.15)],
@@ -151,6 +152,7 @@ def test_three_lidars_with_two_beams(name):
     assert usable[:, near].mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relative", [0.02, 0.10])
 def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     net = triangle()

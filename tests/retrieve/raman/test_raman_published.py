@@ -329,6 +329,7 @@ def test_default_windows_hold_particles_that_their_error_covers(case):
     assert np.mean(np.abs(z) > 4.0) <= 1e-3
 
 
+@pytest.mark.slow
 def test_other_realisations_are_covered_with_default_windows(case):
     found = by_default(case, *other(case, 90, seed=8))
     z = dict(normalised(case, found))["backscatter"]
@@ -341,6 +342,7 @@ def test_other_realisations_are_covered_with_default_windows(case):
     assert abs(np.mean((found.backscatter - truth)[:, near]) / truth[near].mean()) < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", [1, 4])
 def test_a_layer_in_most_windows_gives_few_false_values(case, light):
     """Scattering ratio 1.15 from 8 to 10.5 km, which makes backscatter too small by a fourth."""

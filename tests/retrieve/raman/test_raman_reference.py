@@ -37,6 +37,7 @@ def test_clean_air_is_as_rarely_rejected_as_the_tests_state(light, brightness):
     assert np.isnan(found.reference.bottom).sum() <= 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("light", "brightness"), LEVELS)
 def test_the_choice_among_windows_leaves_no_bias(light, brightness):
     sky, found = retrieved(light, brightness, SEVERAL, rows=120, seed=2)

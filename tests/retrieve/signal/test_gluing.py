@@ -57,6 +57,7 @@ def intercept_error(line):
     return np.sqrt(line["centre_variance"] + line["centre"] ** 2 * line["slope_variance"])
 
 
+@pytest.mark.slow
 def test_the_line_minimises_its_misfit():
     """Four iterations reach the minimum of a general minimiser."""
     rng = np.random.default_rng(1)

@@ -67,6 +67,7 @@ def test_of_a_thousand_profiles_without_light_ten_at_most_are_missed():
         assert dark_of({"elastic": counts})["elastic"][120:].sum() >= 990
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [photons, analog])
 def test_light_that_a_profile_shows_itself_is_never_none(made):
     """Attenuated as dust on the window does, however much: at 11 errors, none of 20,000 is dark."""
