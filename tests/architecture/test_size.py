@@ -30,7 +30,7 @@ MOST = {
     "lines of the largest package": 5_978,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 60, "functions": 582, "changes": 243},
+    "homogeneous": {"modules": 61, "functions": 582, "changes": 243},
     "elastic": {"modules": 70, "functions": 717, "changes": 253},
 }
 
