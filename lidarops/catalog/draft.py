@@ -25,7 +25,7 @@ from lidarops.catalog.folder import (
     Purpose,
     instruments_of,
 )
-from lidarops.catalog.granules import misdated
+from lidarops.catalog.raw_files import misdated
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
-from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -19,7 +17,6 @@ from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
 from lidarops.catalog.raw_files import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
-    MISDATED,
     ChannelLayout,
     DetectionMode,
     FileNote,
@@ -33,9 +30,6 @@ from lidarops.records import (
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
-_FEWEST_IN_ORDER: Final = 5
-"""Files whose starts follow the order of names not by chance."""
-_MINUTE: Final = "%Y-%m-%d %H:%M"
 _MOST_VALUES: Final = 3
 """Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
 
@@ -389,77 +383,3 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
     stored["contradictions"] = _sentences(stored["contradictions"])
     stored["layout"] = layouts[stored["layout"]]
     return Granule(**stored)
-
-
-def misdated(starts: Mapping[str, datetime]) -> dict[str, str]:
-    """Return path -> why a file is refused, of those of another date than their neighbours by name.
-
-    Given are the starts, by path, of files whose names tell no time.
-    """
-    return {
-        path: f"{MISDATED}, {' and '.join(f'{one} ({starts[one]:{_MINUTE}})' for one in beside)}:"
-        f" it starts {starts[path]:{_MINUTE}} (correct the date in its header; if it is right,"
-        " rename the file or move it to another folder)"
-        for path, beside in out_of_order(starts, timedelta(days=1)).items()
-    }
-
-
-def out_of_order(
-    starts: Mapping[str, datetime], room: timedelta = timedelta()
-) -> dict[str, list[str]]:
-    """Return the files that start before or after both files beside them by name, and these.
-
-    These are the nearest of the longest run of files whose starts follow the order of names. Names
-    have an order in one folder, where they agree but for numbers: a file may be renamed. None where
-    over one and an eighth of the files are away, or too few are not: names that count anew each day
-    tell no order. Six files follow it but for one in less than 4 % of all orders.
-
-    Parameters
-    ----------
-    starts : mapping of str to datetime
-        By path.
-    room : timedelta
-        By how much more than that. Files that are less away do not count against the order.
-    """
-    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for path in sorted(starts, key=_by_number):
-        folder, _, name = path.rpartition("/")
-        alike[folder, without_numbers(name)].append(path)
-    return {
-        paths[place]: [paths[other] for other in beside]
-        for paths in alike.values()
-        for place, beside in _away(
-            [starts[path].timestamp() for path in paths], room.total_seconds()
-        ).items()
-    }
-
-
-def _by_number(path: str) -> list[str | int]:
-    """Return a key that orders f9 before f10."""
-    parts = re.split(r"(\d+)", path)
-    return [int(part) if number % 2 else part for number, part in enumerate(parts)]
-
-
-def _away(times: Sequence[float], room: float) -> dict[int, list[int]]:
-    """Return the places away from the longest run of times that does not fall, with the nearest."""
-    # Last file of the best run of each length, and the file before each (patience sorting).
-    ends: list[int] = []
-    previous: list[int] = []
-    for place, time in enumerate(times):
-        length = bisect_right(ends, time, key=times.__getitem__)
-        previous.append(ends[length - 1] if length else -1)
-        ends[length : length + 1] = [place]
-    run = ends[-1:]
-    while run and previous[run[-1]] >= 0:
-        run.append(previous[run[-1]])
-    run.reverse()
-    places, within = {}, set(run)
-    for place in (place for place in range(len(times)) if place not in within):
-        after = bisect_right(run, place)
-        before, later = run[max(after - 1, 0) : after], run[after : after + 1]
-        if any(times[place] < times[one] - room for one in before) or any(
-            times[place] > times[one] + room for one in later
-        ):
-            places[place] = before + later
-    enough = len(times) - len(places) >= _FEWEST_IN_ORDER
-    return places if enough and len(places) <= max(1, len(times) // 8) else {}

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.campaign.path_patterns import path_pattern
-from lidarops.catalog.granules import DatedFile, Fingerprint, misdated
+from lidarops.catalog.granules import DatedFile, Fingerprint
 from lidarops.catalog.raw_files import (
     GranuleRow,
     Headers,
@@ -23,6 +23,7 @@ from lidarops.catalog.raw_files import (
     Source,
     UnreadFile,
     acknowledged_reasons,
+    misdated,
     printable,
     read_row,
     unread_row,

@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from statistics import median
 from typing import Any, Final, NamedTuple
 
-from lidarops.catalog.granules import out_of_order
+from lidarops.catalog.raw_files import out_of_order
 from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import FEWEST_ALIKE, Granule, Role, Status, day_of

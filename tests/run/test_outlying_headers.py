@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.archives.small_archive import DAY, Archive
 
 from lidarops.campaign.model import load_campaign
-from lidarops.catalog.granules import out_of_order
+from lidarops.catalog.raw_files import misdated, out_of_order
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.raw.formats import RawFile, read_raw_header
@@ -400,3 +400,29 @@ def test_no_measured_file_lies_off_those_around_it(
     # One file of the test archive stems from elsewhere.
     foreign = Outlying("", "site CHICAGO, the files around it U-C_VOL_")
     assert outlying == ({foreign} if name == "savant" else set())
+
+
+DATES = {
+    "the second of all": ([0, -60, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], {1}),
+    "two of eleven": ([0, 0, 0, 100, 0, 0, 0, 60, 0, 0, 0], {3, 7}),
+    "four neighbours of sixteen": ([0] * 6 + [300] * 4 + [0] * 6, {6, 7, 8, 9}),
+    "numbers that begin again": ([3] * 80 + [0] * 10, set()),
+}
+"""Days by which files of one night are off, and the places of those that are wrong."""
+
+
+@pytest.mark.parametrize(("days", "wrong"), DATES.values(), ids=DATES)
+def test_a_date_is_wrong_where_files_on_both_sides_contradict_it(
+    days: list[int], wrong: set[int]
+) -> None:
+    first = datetime(2024, 6, 1, tzinfo=UTC)
+    starts = [first + timedelta(days=off, minutes=k) for k, off in enumerate(days)]
+    assert set(misdated(_counted(starts))) == {f"raw/f{place:03}" for place in wrong}
+
+
+def test_names_of_one_number_are_in_an_order_of_their_own() -> None:
+    first = datetime(2024, 6, 1, tzinfo=UTC)
+    starts = _counted([first + timedelta(minutes=k) for k in range(9)])
+    starts["raw/f4"] = first + timedelta(days=90)
+    turned = dict(reversed(starts.items()))
+    assert misdated(turned) == misdated(starts) != {}
