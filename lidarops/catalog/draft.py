@@ -319,9 +319,9 @@ def _full_overlap(look: FirstLook | None) -> Iterator[str]:
             f"full_overlap_range: {found:g}  # ? m, nearer bins are not used; at least:"
             f" signals rise up to there, ± {look.within:g} m"
         )
-        return
-    seen = "" if found is None else f", signals stop rising at {found:g} ± {look.within:g} m"
-    yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
+    else:
+        seen = "" if found is None else f", signals stop rising at {found:g} ± {look.within:g} m"
+        yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
     yield "full_overlap_assumed: true  # until full_overlap_range is checked"
 
 
