@@ -36,7 +36,6 @@ from lidarops.raw.formats import RawFile, read_all_counts
 from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, Scene, SceneOutcome, file_channels, is_glued
 from lidarops.reports.rejections import UNLIT, rejection_rows
-from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.light import light_begins, rise_ends
 from lidarops.run.archive import bring_up_to_date
 from lidarops.run.scenes import scan_cycles_of
@@ -49,6 +48,8 @@ from lidarops.simulate.atmosphere import clock_of_sky
 
 _MOST_FILES: Final = 96
 """Files of a look: all of half an hour of minutes, or four of each hour of a day."""
+_FEW: Final = 5
+"""Files that tell what an instrument gives, and parts that tell how that scatters."""
 _MOST_DARK: Final = 20
 _HIGHEST: Final = 8000.0
 """m; usable values count below."""
@@ -244,12 +245,12 @@ def empty_in_first_files(
         cycles = scan_cycles_of(scene.granules)
         ((whole, beams),) = Counter(cycles).most_common(1)
         own = (g for g, cycle in zip(scene.granules, cycles, strict=True) if cycle == whole)
-        begin = scene.granules[: _MOST_DARK + COMMON.fewest_profiles]
+        begin = scene.granules[: _MOST_DARK + _FEW]
         lit = begin if beams > 1 else _lit(campaign, scene, begin)
         if dark := len(begin) - len(lit):
             share = f"{dark} of the first {len(begin)} files"
             yield f"all of {scene.instrument}", "no light", share, UNLIT
-        first = replace(scene, granules=tuple(own) if beams > 1 else lit[: COMMON.fewest_profiles])
+        first = replace(scene, granules=tuple(own) if beams > 1 else lit[:_FEW])
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
@@ -299,9 +300,7 @@ def _full_overlap(lit: xr.Dataset, channels: Iterable[str]) -> tuple[float | Non
     if not ends:
         return None, _OF_ONE
     last = max(ends, key=ends.__getitem__)
-    parts = np.array_split(
-        np.arange(lit.sizes["time"]), min(COMMON.fewest_profiles, lit.sizes["time"])
-    )
+    parts = np.array_split(np.arange(lit.sizes["time"]), min(_FEW, lit.sizes["time"]))
     known = [rise_ends(*_mean(lit.isel(time=part), last)) for part in parts]
     apart = [end for end in known if end is not None]
     scatter = max(float(np.std(apart, ddof=1)), _STEP) if len(apart) > 1 else _OF_ONE
@@ -334,15 +333,12 @@ def _is_unlit(group: FileGroup, groups: Iterable[FileGroup], root: Path) -> bool
     A few files tell that beside those of the largest group with the same channels alone.
     """
     members = list(zip(group.files, group.headers, strict=True))
-    if len(members) < COMMON.fewest_profiles:
+    if len(members) < _FEW:
         alike = (g for g in groups if (g.purpose, g.layout) == (group.purpose, group.layout))
         largest = max(alike, key=lambda one: len(one.files))
         members += zip(largest.files, largest.headers, strict=True)
-    step = len(members) // (2 * COMMON.fewest_profiles) or 1
-    starts = {
-        path: header.start
-        for path, header in (*members[: COMMON.fewest_profiles], *members[::step])
-    }
+    step = len(members) // (2 * _FEW) or 1
+    starts = {path: header.start for path, header in (*members[:_FEW], *members[::step])}
     try:
         paths = [root / path for path in starts]
         unlit = _unlit(open_archive(paths, mask_and_scale=False, header_position="ignore"))

@@ -109,7 +109,7 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
     right, right_range = right / right_count, right_range / right_count
     step = abs(right - left)
     allowed = max(
-        COMMON.contradicted * np.sqrt(largest_variance),
+        THRESHOLDS.step_by_noise * np.sqrt(largest_variance),
         COMMON.largest_step * max(abs(left), abs(right)),
     )
     if not step <= allowed:

@@ -16,6 +16,10 @@ class Thresholds(NamedTuple):
     """Neighbours of equal power: more of them mean few counts, whose noise is not normal. Assumed.
     """
 
+    step_by_noise: float = 4.0
+    """Standard deviations of the noise of a bin, or 5.7 of the difference of the means of 4, by
+    which the signal may change across a bin. Assumed."""
+
     # Clouds
     window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0, 1920.0)
     """m; in which signals are averaged below and above a base: the longest finds cirrus that rises
@@ -41,8 +45,6 @@ class Thresholds(NamedTuple):
     definition; a cirrus of optical depth 0.05 is deeper (`test_layers.py`)."""
     visible_excess: float = 2.0
     """Its excess over the least one of a cloud. By definition; with 1, noise hides every layer."""
-
-    # Overlap
 
 
 THRESHOLDS: Final = Thresholds()

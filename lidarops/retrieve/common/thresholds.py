@@ -29,7 +29,7 @@ class Thresholds(NamedTuple):
     symmetrical; with 5, none is left at 355 nm of the published simulations."""
     contradicted: float = 4.0
     """Standard errors beyond what is possible at which a value contradicts the signal or its
-    overlap, or both sides of a bin each other. Of 3,000 profiles of simulated haze, 1 does
+    overlap. Of 3,000 profiles of simulated haze, 1 does
     (`test_raman_coverage.py`); in Manaus at 355 nm, where the overlap is not full as stated, values
     lie 57 below."""
     first_order: float = 5.0

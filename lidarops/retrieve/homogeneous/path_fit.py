@@ -244,13 +244,13 @@ def _noise_of_profiles(
 def _known_extinction(extinction: npt.ArrayLike, length: float, leading: tuple[int, ...]) -> Array:
     """Return the prior or known extinction in m-1, (profile or 1,)."""
     prior = inputs.profile_values(extinction, "extinction", leading)
-    limit = THRESHOLDS.highest_optical_depth / length
+    limit = THRESHOLDS.largest_optical_depth / length
     if np.any(np.abs(prior) > limit):
         raise RetrievalInputError(
             f"holds values up to {np.max(np.abs(prior)):g} m-1: it must be in m-1",
             field="extinction",
             remedy=f"stay within +-{limit:g} m-1"
-            f" ({THRESHOLDS.highest_optical_depth:g} over the length)",
+            f" ({THRESHOLDS.largest_optical_depth:g} over the length)",
         )
     return prior
 

@@ -13,7 +13,10 @@ class Thresholds(NamedTuple):
     """1 / last range. Where extinction approaches -1 / range, the shape stops falling and a second
     minimum appears. Simulations: 7 % of the fits end there with -0.5 / length, none above this."""
     highest_optical_depth: float = 60.0
-    """Over the section, retrieved or given: the signal vanishes after two of 225 bins. Assumed."""
+    """Over the section: the signal vanishes after two of 225 bins. Assumed."""
+    largest_optical_depth: float = 300.0
+    """Over the section, of a given extinction: beyond, the exponential leaves the range of floats.
+    """
     least_curvature: float = 0.3
     """Curvature over that of Gauss-Newton, below which a step is one of Gauss-Newton. Assumed."""
 

@@ -86,8 +86,6 @@ class Thresholds(NamedTuple):
     """Data share below which the prior determines the extinction of "mld" and "mld_prior"; by
     definition."""
 
-    # Values (`labeled`).
-
     # Horizontal gradient (`_block`, `_horizontal_variation`, `optical_depth`).
     gradient_variance: float = 9.0
     """Variance of an optical depth that the fit of a gradient may add, over that without it: beams
