@@ -16,7 +16,7 @@ from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.cli.app import from_here, show_rows, wrapped
+from lidarops.cli.app import from_here, show_rows, show_tables, wrapped
 from lidarops.kinds import flags_of
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
@@ -104,6 +104,16 @@ def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
         assert re.search(r"Refused, the first [3-9] of 10 \(--all\)", run.output)
     whole = CliRunner().invoke(app, ["reprocess", str(archive.file), "--force", "--all"])
     assert len(whole.output.splitlines()) > 150
+
+
+def test_products_made_again_without_a_change_are_only_counted(tmp_path: Path) -> None:
+    file = written(tmp_path, products={"signal": {}})
+    for options in ([], ["--force"]):
+        run = CliRunner().invoke(app, ["reprocess", str(file), *options])
+    made = re.search(r"^(\d+ products), summed", run.output, re.MULTILINE)
+    assert made
+    assert f"{made[1]} made again without a change\n" in run.output
+    assert "Products made again" not in run.output
 
 
 def test_a_block_is_of_one_period_of_facts_and_says_how_many_scenes_a_line_is_of(
@@ -318,6 +328,14 @@ def test_a_campaign_whose_only_file_is_refused_says_why_nothing_is_planned(tmp_p
         texts.append(shown.output)
     assert codes == {1}
     assert "1 file refused" in texts[0]
+
+
+def test_main_tables_are_cut_after_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    tables = [(title, ("",), [(title,)] * 6) for title in ("sum", "other")]
+    for lines, sums, others in ((9, 6, 1), (6, 3, 1), (3, 1, 0)):
+        assert show_tables(tables, 45, lines, main=1) == lines
+        shown = capsys.readouterr().out
+        assert (shown.count("  sum\n"), shown.count("  other\n")) == (sums, others)
 
 
 def test_rows_become_paragraphs_where_columns_are_too_narrow(
