@@ -253,8 +253,8 @@ def show_tables(
     """
     whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
     shown = [_table(*table, most) for table in whole]
-    others, few = range(main, len(whole)), range(most or 0, 0, -1)
-    for numbers, rows in (*product((others, range(main)), few), (others, 0)):
+    parts = range(main, len(whole)), range(main)
+    for numbers, rows in product(parts, range(most or 0, -1, -1)):
         if most is None or sum(map(len, shown)) <= lines:
             break
         for number in numbers:

@@ -413,7 +413,7 @@ def _print_result(
     scenes = result.scenes
     tables = _product_tables(scenes, everything=everything)
     found = _tables(result, removing=removing)
-    show_tables((*tables, *found), None if everything else _LINES, _LINES, main=1)
+    show_tables((*tables, *found), None if everything else _LINES, _LINES, main=2)
     products = [product for scene in scenes for product in scene.products]
     same = sum(each.change is not None and each.change.grade is Grade.NONE for each in products)
     say_wrapped(f"{counted(same, 'product')} made again without a change" if same else "", "")
@@ -493,7 +493,7 @@ def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str
 
 
 def _product_tables(scenes: Sequence[SceneOutcome], *, everything: bool) -> Iterator[Table]:
-    """Yield what was made: the sums of each kind and channel, and with `everything` each product.
+    """Yield sums of each kind and channel and what failed, and with `everything` each product.
 
     A sum ends with advice: the settings that most rejected values follow from.
     """
