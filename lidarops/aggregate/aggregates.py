@@ -102,7 +102,8 @@ def make_aggregates(
     products = _products(root, selection, made, known, progress)
     if not products:
         _refuse_unknown(root, selection)
-        raise ProductError("no product found", file=root, remedy=_remedy(made))
+        absent, remedy = not list_products(root), _remedy(made)
+        raise ProductError("no product found", file=root, remedy=remedy, wrong_use=absent)
     made.products = len(products)
     by_group = groups(products)
     made.notes += grid_notes(by_group)

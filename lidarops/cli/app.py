@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import wraps
-from itertools import chain
+from functools import partial, wraps
+from itertools import chain, product
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec, TypeVar
 
 import typer
 
@@ -43,6 +43,7 @@ NO_SCENE: Final = "nothing to do: the selection contains no scene of the archive
 Table = tuple[str, Iterable[str], Iterable[Iterable[Any]]]
 """Title, names of columns, and rows."""
 _P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 PROGRESS_INTERVAL: float = 30.0
 """s between lines of progress where there is no terminal."""
@@ -75,29 +76,36 @@ def command(
     """Register a function as a command that shows a lidarops error as a line, not a traceback."""
 
     def registered(function: Callable[_P, None]) -> Callable[_P, None]:
-        @wraps(function)
-        def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> None:
-            try:
-                function(*args, **kwargs)
-            except LidarOpsError as error:
-                show_error(error)
-                raise typer.Exit(error.exit_code) from error
-            except OSError as error:
-                # Typer ends quietly where the reader of a pipe has gone.
-                if error.errno == errno.EPIPE:
-                    raise
-                name = error.filename
-                problem = LidarOpsError(
-                    error.strerror or repr(error),
-                    file=None if name is None else os.fsdecode(name),
-                    remedy="check permissions, space and connection, then run the command again",
-                )
-                show_error(problem)
-                raise typer.Exit(UNAVAILABLE) from error
-
-        return program.command(name, help=_paragraphs(function.__doc__ or ""), **options)(wrapped)
+        help_ = _paragraphs(function.__doc__ or "")
+        return program.command(name, help=help_, **options)(_ending_with_a_line(function))
 
     return registered
+
+
+def _ending_with_a_line(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Return a function that shows a lidarops error as a line, and ends with its exit code."""
+
+    @wraps(function)
+    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        try:
+            return function(*args, **kwargs)
+        except LidarOpsError as error:
+            show_error(error)
+            raise typer.Exit(error.exit_code) from error
+        except OSError as error:
+            # Typer ends quietly where the reader of a pipe has gone.
+            if error.errno == errno.EPIPE:
+                raise
+            name = error.filename
+            problem = LidarOpsError(
+                error.strerror or repr(error),
+                file=None if name is None else os.fsdecode(name),
+                remedy="check permissions, space and connection, then run the command again",
+            )
+            show_error(problem)
+            raise typer.Exit(UNAVAILABLE) from error
+
+    return wrapped
 
 
 def _paragraphs(text: str) -> str:
@@ -209,8 +217,9 @@ def progress_bar(name: str, unit: str = "file") -> Iterator[Bar]:
             from rich.live import Live
 
             console = Console(stderr=True)
-            shown = Live(get_renderable=lambda: str(bar), console=console, transient=True)
-            stack.enter_context(shown)
+            # Rarely, because each drawing counts the files of compiled functions.
+            shown = partial(Live, console=console, transient=True, refresh_per_second=0.5)
+            stack.enter_context(shown(get_renderable=lambda: str(bar)))
         else:
             ended = threading.Event()
             teller = threading.Thread(target=_tell, args=(bar, ended), daemon=True)
@@ -232,18 +241,24 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
     show_tables([(title, columns, rows)])
 
 
-def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0) -> int:
+def show_tables(
+    tables: Iterable[Table], most: int | None = None, lines: int = 0, main: int = 0
+) -> int:
     """Print tables of plain text, but those without rows, and return the number of lines.
 
     With `most`, so many rows of each, or fewer where all tables together would fill more than so
-    many lines. On a terminal, cells fold between words only, so that names can be read and copied.
-    Where the words are too long for columns, each row is a paragraph, as are those of one column.
+    many lines; the first `main` tables are cut after the others. On a terminal, cells fold between
+    words only, so that names can be read and copied. Where the words are too long for columns, each
+    row is a paragraph, as are those of one column.
     """
     whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
     shown = [_table(*table, most) for table in whole]
-    while most and sum(map(len, shown)) > lines:
-        most -= 1
-        shown = [_table(*table, most) for table in whole]
+    parts = range(main, len(whole)), range(main)
+    for numbers, rows in product(parts, range(most or 0, -1, -1)):
+        if most is None or sum(map(len, shown)) <= lines:
+            break
+        for number in numbers:
+            shown[number] = _table(*whole[number], rows)
     for line in chain.from_iterable(shown):
         typer.echo(line)
     return sum(map(len, shown))
@@ -335,6 +350,7 @@ def stated(place: Path) -> Path:
     return file if file.is_file() else place
 
 
+@_ending_with_a_line
 def campaign_file(place: Path) -> Path:
     """Return the campaign file in a folder, or that of an output folder; a file as it is."""
     if not (place := stated(place)).is_dir():
@@ -344,8 +360,12 @@ def campaign_file(place: Path) -> Path:
 
     ledger, found = place / "catalog.sqlite", []
     if ledger.exists():
-        with Store(f"sqlite:///{ledger}", "", create=False) as store:
-            folders = store.campaign_folders()
+        try:
+            with Store(f"sqlite:///{ledger}", "", create=False) as store:
+                folders = store.campaign_folders()
+        except LidarOpsError as error:
+            error.wrong_use, error.remedy = not error.unavailable, "give a campaign file"
+            raise
         for path in chain.from_iterable(sorted(Path(name).glob("*.y*ml")) for name in folders):
             with suppress(LidarOpsError):
                 if Path(load_campaign(path).output) == place.resolve():

@@ -34,7 +34,7 @@ from lidarops.cli.app import (
 )
 from lidarops.cli.plan import Shown, show_scenes
 from lidarops.errors import UNAVAILABLE, LidarOpsError
-from lidarops.records import without_numbers
+from lidarops.records import Grade, without_numbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -244,6 +244,8 @@ def reprocess(
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
     if dry_run:
+        if remove_orphans:
+            raise typer.BadParameter("--dry-run removes nothing: leave out --remove-orphans")
         stated = Shown(stale=True, everything=everything, as_json=as_json, force=force, thaw=thaw)
         show_scenes(settings, selection, stated, wait=wait)
         return
@@ -285,9 +287,7 @@ def reprocess(
             summary |= {"earlier_reports": [str(made) for made in earlier]}
             typer.echo(json.dumps(summary, indent=2))
         else:
-            _print_places(result, page)
-            for made in earlier:
-                say(f"report of an earlier run: {made}")
+            _print_places(result, page, earlier)
     if removed is not None and not as_json:
         most = None if everything else _FEW
         show_tables([_orphan_table(result, f"{removed} removed")], most, _FEW)
@@ -385,7 +385,7 @@ def _run_summary(result: Result, page: Path | None) -> dict[str, Any]:
     }
 
 
-def _print_places(result: Result, page: Path | None) -> None:
+def _print_places(result: Result, page: Path | None, earlier: Iterable[Path]) -> None:
     """Print where the report and the tracebacks of internal errors are."""
     from lidarops.figures.wording import counted
 
@@ -401,18 +401,23 @@ def _print_places(result: Result, page: Path | None) -> None:
             f"{scenes} ended with an internal error: please report it,"
             f" with the traceback in {place}"
         )
+    for made in earlier:
+        say(f"report of an earlier run: {made}")
 
 
 def _print_result(
     campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
 ) -> None:
-    from lidarops.figures.wording import listed
+    from lidarops.figures.wording import counted, listed
 
     scenes = result.scenes
     tables = _product_tables(scenes, everything=everything)
     found = _tables(result, removing=removing)
-    show_tables((*tables, *found), None if everything else _LINES, _LINES)
-    empty = [p for scene in scenes for p in scene.products if p.usable == 0]
+    show_tables((*tables, *found), None if everything else _LINES, _LINES, main=2)
+    products = [product for scene in scenes for product in scene.products]
+    same = sum(each.change is not None and each.change.grade is Grade.NONE for each in products)
+    say_wrapped(f"{counted(same, 'product')} made again without a change" if same else "", "")
+    empty = [product for product in products if product.usable == 0]
     if empty:
         names = listed({f"{product.kind} {product.channel}" for product in empty})
         words = f"products without a usable value, flags say why: {len(empty)} ({names})"
@@ -444,7 +449,7 @@ def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
         for scene in scenes
         for product in scene.products
         for change in [product.change]
-        if change is not None
+        if change is not None and change.grade is not Grade.NONE
     )
     yield "Products made again", ("file", "change", "difference", "cause"), changes
     title = "Frozen products that would be replaced (--thaw replaces them)"
@@ -488,7 +493,7 @@ def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str
 
 
 def _product_tables(scenes: Sequence[SceneOutcome], *, everything: bool) -> Iterator[Table]:
-    """Yield what was made: the sums of each kind and channel, and with `everything` each product.
+    """Yield sums of each kind and channel and what failed, and with `everything` each product.
 
     A sum ends with advice: the settings that most rejected values follow from.
     """

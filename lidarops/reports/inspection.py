@@ -190,6 +190,9 @@ def _product(file: Path, time: str) -> dict[str, Any]:
             one.dims = one.written
         opened = decoded(stored, stored.variables, decode_times=False)
         dataset = _profile(opened, time, file) if time else opened
+        errors = [str(name) for name in opened.variables if str(name).endswith("_error")]
+        main = {end for name in errors for end in (name, name.removesuffix("_standard_error"))}
+        names = sorted(map(str, opened.variables), key=lambda name: name not in main)
         steps = product_contents.origin(dataset).get("steps", [])
         return {
             "type": "netcdf",
@@ -198,7 +201,7 @@ def _product(file: Path, time: str) -> dict[str, Any]:
             "citation": product_contents.citation(dataset),
             "dimensions": {str(name): size for name, size in dataset.sizes.items()},
             "attributes": _plain(dict(dataset.attrs)),
-            "variables": [_variable(str(name), dataset[name]) for name in dataset.variables],
+            "variables": [_variable(name, dataset[name]) for name in names],
             "quality": _quality(dataset),
             "steps": [dict(zip(_STEP, step, strict=True)) for step in steps],
         }
@@ -207,10 +210,11 @@ def _product(file: Path, time: str) -> dict[str, Any]:
 def _profile(dataset: xr.Dataset, time: str, file: Path) -> xr.Dataset:
     """Return the profile of a product that holds a time."""
     try:
-        moment = np.datetime64(time.removesuffix("Z"), "s").astype(np.float64)
+        moment = product_contents.utc_moment(time).astype("datetime64[s]").astype(np.float64)
     except ValueError:
         form = "give a UTC time such as 2024-09-21T15:00"
-        raise LidarOpsError(f"is no time: {time!r}", field="time", remedy=form) from None
+        error = LidarOpsError(f"is no time: {time!r}", field="time", remedy=form, wrong_use=True)
+        raise error from None
     bounds = dataset.get("time_bnds")
     begun = np.zeros(0) if bounds is None else (bounds <= moment).sum("nv").to_numpy()
     inside = np.flatnonzero(begun == 1)

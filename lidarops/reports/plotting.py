@@ -22,6 +22,7 @@ from lidarops.netcdf.stored import reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
+from lidarops.reports.product_contents import utc_moment
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def selection(variable: str, time: str, range_: str, altitude: str) -> Selection
         If an option cannot be read.
     """
     options = (
-        ("time", time, "START/STOP", lambda end: np.datetime64(end.removesuffix("Z"), "ns")),
+        ("time", time, "START/STOP", utc_moment),
         ("range", range_, "LOW/HIGH in km", lambda end: 1e3 * float(end)),
         ("altitude", altitude, "LOW/HIGH in km", lambda end: 1e3 * float(end)),
     )

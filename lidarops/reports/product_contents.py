@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from datetime import datetime
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +37,19 @@ def span(product: xr.Dataset) -> tuple[str, str]:
             raise ValueError("has no time of measurement, neither as attributes nor as a variable")
         ends = [str(time.min()), str(time.max())]
     return _second(ends[0]), _second(ends[1])
+
+
+def utc_moment(text: str) -> np.datetime64:
+    """Return a time in UTC; without an offset from UTC it is UTC.
+
+    Raises
+    ------
+    ValueError
+        If the text is not a date or a time with its date, ISO 8601.
+    """
+    moment = datetime.fromisoformat(text)
+    offset = np.timedelta64(moment.utcoffset() or 0)
+    return np.datetime64(moment.replace(tzinfo=None)) - offset
 
 
 def _second(text: str) -> str:

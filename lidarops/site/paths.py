@@ -46,7 +46,7 @@ def product_folder(output: Path) -> Path:
             "holds no folder `products`",
             file=output,
             remedy="give the output folder of a campaign that was reprocessed",
-            wrong_use=not output.is_dir(),
+            wrong_use=True,
         )
     return folder
 

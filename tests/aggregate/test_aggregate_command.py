@@ -140,7 +140,7 @@ def test_wrong_use_exits_with_2(wrong: list[str], tmp_path: Path):
 
 
 def test_a_folder_without_products_is_refused(tmp_path: Path):
-    assert run(tmp_path)[0] == 1
+    assert run(tmp_path)[0] == 2
     assert run(tmp_path / "nothing")[0] == 2
 
 

@@ -7,6 +7,7 @@ import pkgutil
 import re
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any, get_args
 
@@ -190,6 +191,14 @@ def test_stiff_cases_of_every_retrieval_are_listed_with_what_they_expect() -> No
     assert all(len(cases) >= 5 for cases in rows)
     # A case without expectation cannot fail.
     assert all(expected.strip() for cases in rows for _, expected in cases)
+
+
+def test_the_exit_codes_name_the_kinds_that_may_be_without_usable_values(repository: Path) -> None:
+    page = (repository / "docs/reference/command_line.md").read_text()
+    named = re.search(r"has no usable value \(of other products than (.+?)\)", page)
+    assert named
+    free = {name for name in OWN_KINDS if not kinds()[name].expects_usable}
+    assert set(re.findall(r"`(\w+)`", named[1])) == free
 
 
 def test_commands_are_apart() -> None:

@@ -60,12 +60,25 @@ def test_a_time_selects_the_profile_that_holds_it(tmp_path: Path):
     largest = float(second["aerosol_backscatter"].max())
     assert values["aerosol_backscatter"]["maximum"] == pytest.approx(largest)
     assert sum(row["values"] for row in within["quality"][:3]) == second.sizes["range"]
-    for wrong in ("1999-01-01", "noon"):
+    west = begin + (end - begin) // 2 - np.timedelta64(3, "h")
+    assert describe(path, f"{west}-03:00") == within
+    for wrong in ("1999-01-01", "noon", "17:40"):
         shown = CliRunner().invoke(app, ["inspect", str(path), "--time", wrong])
-        assert shown.exit_code != 0
+        assert shown.exit_code == 2
         assert wrong in shown.output
     folder = CliRunner().invoke(app, ["inspect", str(tmp_path), "--time", str(begin)])
     assert folder.exit_code == 2
+
+
+def test_variables_with_errors_come_before_coordinates_and_bounds(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write_product(build_product(MAKERS["signal"](), context("signal")), path)
+    names = [row["name"] for row in describe(path)["variables"]]
+    assert names[:2] == ["signal", "signal_standard_error"]
+    main = {name.removesuffix("_standard_error") for name in names if name.endswith("_error")}
+    rest = [name for name in names if name not in main and not name.endswith("_error")]
+    assert names[-len(rest) :] == rest
+    assert {"time", "time_bnds", "range"} <= set(rest)
 
 
 def test_a_product_tells_its_settings_and_how_to_cite_it(tmp_path: Path):

@@ -34,6 +34,16 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     assert re.fullmatch(words, last)
 
 
+def test_a_terminal_counts_compiled_functions_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts: list[float] = []
+    monkeypatch.setattr(MODULE, "compiled_functions", lambda: counts.append(0.0))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with progress_bar("site", "product"):
+        begun = len(counts)
+        time.sleep(1.0)
+        assert len(counts) <= begun + 1
+
+
 def test_compilation_is_told_and_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

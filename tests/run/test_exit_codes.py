@@ -64,6 +64,22 @@ def test_a_refused_file_is_told_from_wrong_use(archive: Archive) -> None:
     assert invoke(archive, "reprocess", "--nothing").exit_code == WRONG_USE
 
 
+def test_a_dry_run_that_should_remove_is_wrong_use(archive: Archive) -> None:
+    refused = invoke(archive, "reprocess", "--dry-run", "--remove-orphans")
+    assert refused.exit_code == WRONG_USE
+    assert "--remove-orphans" in refused.output
+
+
+@pytest.mark.parametrize("content", [b"", b"no catalog " * 500])
+def test_a_folder_whose_catalog_names_no_campaign_is_wrong_use(
+    tmp_path: Path, content: bytes
+) -> None:
+    (tmp_path / "catalog.sqlite").write_bytes(content)
+    shown = CliRunner().invoke(app, ["plan", str(tmp_path)])
+    assert shown.exit_code == WRONG_USE
+    assert re.fullmatch(r"error: .*catalog\.sqlite: .* \(give a campaign file\)\n", shown.output)
+
+
 @pytest.mark.parametrize("command", ["catalog", "plan", "reprocess", "runs"])
 def test_a_dead_database_and_a_wrong_password_do_not_serve(archive: Archive, command: str) -> None:
     dead = invoke(archive, command, "--catalog", "postgresql+psycopg://user@127.0.0.1:1/name")

@@ -16,7 +16,7 @@ from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.cli.app import from_here, show_rows, wrapped
+from lidarops.cli.app import from_here, show_rows, show_tables, wrapped
 from lidarops.kinds import flags_of
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
@@ -215,7 +215,7 @@ def test_scenes_that_all_differ_fill_a_screen_or_two(
     shown = _STYLE.sub("", run.output)
     assert on_screen(shown.splitlines(), width) <= MOST_LINES
     assert re.search(r"[0-9]+ products, summed \(--all lists them\), the first [1-9]", shown)
-    assert re.search(r"Refused, the first [1-9] of [0-9]+ \(--all\)", shown)
+    assert re.search(r"Refused, the first [0-9] of [0-9]+ \(--all\)", shown)
     assert len(planned(file, "--all", width=width)) > MOST_LINES
 
 
@@ -318,6 +318,14 @@ def test_a_campaign_whose_only_file_is_refused_says_why_nothing_is_planned(tmp_p
         texts.append(shown.output)
     assert codes == {1}
     assert "1 file refused" in texts[0]
+
+
+def test_main_tables_are_cut_after_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    tables = [(title, ("",), [(title,)] * 6) for title in ("sum", "other")]
+    for lines, sums, others in ((9, 6, 1), (8, 6, 0), (3, 1, 0)):
+        assert show_tables(tables, 45, lines, main=1) == lines
+        shown = capsys.readouterr().out
+        assert (shown.count("  sum\n"), shown.count("  other\n")) == (sums, others)
 
 
 def test_rows_become_paragraphs_where_columns_are_too_narrow(

@@ -110,6 +110,15 @@ def test_a_forced_run_keeps_files_whose_content_is_the_same(source: Archive) -> 
     assert {path: (root / path).stat().st_mtime_ns for path in _paths(root)} == times
 
 
+def test_products_made_again_without_a_change_are_only_counted(source: Archive) -> None:
+    words = ["reprocess", str(source.file), "--instrument", "poor", "--force"]
+    shown = CliRunner().invoke(app, words).output
+    made = re.search(r"^(\d+ products), summed", shown, re.MULTILINE)
+    assert made
+    assert f"\n{made[1]} made again without a change\n" in shown
+    assert "Products made again" not in shown
+
+
 def test_plan_names_what_changed_since_a_product_was_made(source: Archive) -> None:
     set_dead_time(source, 3.7e-9)
     source.tree.setdefault("metadata", {})["institution"] = "another one"

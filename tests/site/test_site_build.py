@@ -446,3 +446,8 @@ def test_processes_end_with_a_killed_build(tmp_path: Path) -> None:
     while any(Path(f"/proc/{process}").exists() for process in processes):
         assert time.monotonic() < give_up
         time.sleep(0.05)
+
+
+def test_a_folder_without_products_is_wrong_use(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["site", str(tmp_path)])
+    assert (result.exit_code, "holds no folder `products`" in result.output) == (2, True)
