@@ -412,7 +412,7 @@ def _csv_records(text: str, name: str, titles: list[str]) -> Iterator[Record | A
     columns: dict[str, tuple[str, list[str]]] = {}
     for place, head in enumerate(heads):
         # The last part of a title is a unit where the rest is a known name.
-        title = re.fullmatch(r"(.*?) *(?:[\[(](.*)[\])]|_([^_]+))? *", head.lower())
+        title = re.fullmatch(r"(.*?) *(?:[\[(](.*)[\])]|_([^_\[(]+))? *", head.lower())
         known = {one for each in _QUANTITIES.values() for one in each.names}
         parts = (title[1], title[2] or title[3] or "") if title else (head, "")
         label, unit = parts if parts[0] in known else (head.lower().strip(), "")

@@ -208,6 +208,30 @@ def test_rows_with_other_numbers_of_cells_are_told(tmp_path: Path) -> None:
         read(path)
 
 
+@each(
+    "title, cell",
+    [
+        ("relative_humidity [%]", "50"),
+        ("relative_humidity_%", "50"),
+        ("dew_point [degC]", "-1.0"),
+        ("dew_point_C", "-1.0"),
+        ("specific_humidity [g/kg]", "5.0"),
+        ("mixing_ratio (g/kg)", "5.0"),
+    ],
+)
+def test_units_stand_in_titles_of_two_words(tmp_path: Path, title: str, cell: str) -> None:
+    """Else the air would be dry without a word."""
+    rows = [
+        f"{p:.0f},{t:.2f},{z:.0f},{cell}" for z, p, t in zip(*sounding_texts.air(), strict=True)
+    ]
+    head = f"pressure [Pa],temperature [K],geopotential_height [m],{title}"
+    path = text(tmp_path / "s_2026.csv", "\n".join([head, *rows]))
+    (found,) = read(path, name_time="s_%Y.csv", **GIVEN)
+    check(found)
+    assert found.profile.water_vapour is not None
+    assert 0.004 < found.profile.water_vapour[0] < 0.01
+
+
 def test_rules_of_igra(tmp_path: Path) -> None:
     """Hours of releases, temperatures below -88.8 degC, and the surface without height."""
     path, whole = tmp_path / "i.txt", TEXTS["igra.txt"](NOON, 0.0)
