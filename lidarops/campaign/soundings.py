@@ -656,7 +656,11 @@ def _sounding(record: Record, name: str, reading: AtmosphereReading) -> TimedPro
             remedy="give each its time in a column time, or its own file",
         )
     time, place = _time_and_place(record, name, reading)
-    share = vapour_share(**found)
+    # A humidity without any value hides no other one.
+    needed = ("pressure", "temperature")
+    share = vapour_share(
+        **{key: one for key, one in found.items() if key in needed or np.isfinite(one).any()}
+    )
     levels = _levels(heights[0], found["pressure"], found["temperature"], share)
     reach = float(np.ptp(levels[0])) if levels.size else 0.0
     if levels.shape[1] < _FEWEST or reach < _LEAST_REACH:

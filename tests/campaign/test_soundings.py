@@ -217,6 +217,7 @@ def test_rows_with_other_numbers_of_cells_are_told(tmp_path: Path) -> None:
         ("dew_point_C", "-1.0"),
         ("specific_humidity [g/kg]", "5.0"),
         ("mixing_ratio (g/kg)", "5.0"),
+        ("dew_point [degC],rh [%]", "-9999,50"),
     ],
 )
 def test_units_stand_in_titles_of_two_words(tmp_path: Path, title: str, cell: str) -> None:
