@@ -298,17 +298,17 @@ def _plain_parts(pattern: str) -> list[str]:
 def _read(
     folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
 ) -> tuple[list[list[Any]], str]:
-    """Return the profiles of a file, as of `_Found`, or why it cannot be used."""
-    from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
+    """Return the profiles of a file, as of `_Found`, and what of it cannot be used."""
+    from lidarops.campaign.soundings import read_soundings  # noqa: PLC0415 - loads xarray
 
     try:
-        read = soundings(folder, name, reading, place)
+        read, problem = read_soundings(folder, name, reading, place)
     except AncillaryError as error:
         return [], str(error).removeprefix(f"{name}: ")
     return [
         [one.time.isoformat(), name, number, one.latitude, one.longitude, one.origin]
         for number, one in enumerate(read)
-    ], ""
+    ], problem
 
 
 def _loaded(kept: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import contextlib
 import gzip
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,9 @@ from support.archives.sounding_texts import COLUMNS, HEIGHTS, LATITUDE, LONGITUD
 from support.cases import each
 
 from lidarops.campaign.atmosphere import AtmosphereReading
-from lidarops.campaign.soundings import TimedProfile, soundings
+from lidarops.campaign.soundings import TimedProfile, read_soundings, soundings
 from lidarops.errors import AncillaryError
-from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
 PLACE = LATITUDE, LONGITUDE
@@ -28,6 +28,12 @@ GIVEN = {"latitude": LATITUDE, "longitude": LONGITUDE}
 
 def read(path: Path, **given: object) -> tuple[TimedProfile, ...]:
     return soundings(path.parent, path.name, AtmosphereReading.model_validate(given), PLACE)
+
+
+def damage(path: Path) -> tuple[list[datetime], str]:
+    """Return the times of what is used of a file, and what is damaged."""
+    found, words = read_soundings(path.parent, path.name, AtmosphereReading(), PLACE)
+    return [one.time for one in found], words
 
 
 def check(found: TimedProfile, *, geometric: bool = False) -> None:
@@ -113,6 +119,173 @@ def test_several_soundings_of_one_file_and_packed_files(tmp_path: Path) -> None:
         assert [found.time for found in read(tmp_path / name)] == times
 
 
+def test_packed_netcdf_is_read(tmp_path: Path) -> None:
+    sounding_texts.arm(tmp_path / "arm.cdf", NOON)
+    content = (tmp_path / "arm.cdf").read_bytes()
+    (tmp_path / "arm.cdf.gz").write_bytes(gzip.compress(content))
+    (found,) = read(tmp_path / "arm.cdf.gz")
+    check(found, geometric=True)
+
+
+def test_a_table_with_several_times_holds_several_soundings(tmp_path: Path) -> None:
+    """As one, its levels would be those of both, sorted by pressure."""
+    times = [NOON.replace(hour=0), NOON]
+    (head, *first), (_, *second) = (
+        sounding_texts.wyoming_csv(time, shift).splitlines()
+        for time, shift in zip(times, (0.0, 15.0), strict=True)
+    )
+    expected = sounding_texts.air(15.0)[2]
+    for rows in (first + second, [row for pair in zip(first, second, strict=True) for row in pair]):
+        path = text(tmp_path / "s.csv", "\n".join([head, *rows]))
+        early, late = read(path)
+        assert [early.time, late.time] == times
+        check(early)
+        np.testing.assert_allclose(late.profile.temperature, expected, atol=0.06)
+    # Without times, another one begins where pressure is again that of the ground; a single wrong
+    # pressure is none.
+    rows = [sounding_texts.chain(NOON, shift) for shift in (0.0, 15.0)]
+    given = {"columns": list(COLUMNS), "name_time": "s_%Y.csv", **GIVEN}
+    with pytest.raises(AncillaryError, match="pressure: begins again: these are several soundings"):
+        read(text(tmp_path / "s_2026.csv", "\n".join(rows)), **given)
+    one = rows[0].splitlines()
+    one[5] = "3600.0,265.0,100.0"
+    (found,) = read(text(tmp_path / "s_2026.csv", "\n".join(one)), **given)
+    assert found.profile.altitude.size == HEIGHTS.size - 1
+
+
+@each("name", ["wyoming.txt", "igra.txt"])
+def test_a_damaged_sounding_costs_itself(tmp_path: Path, name: str) -> None:
+    times = [NOON.replace(hour=hour) for hour in (0, 6, 12)]
+    first, second, third = (TEXTS[name](time, 0.0) for time in times)
+    path, left = tmp_path / name, [times[0], times[2]]
+    for damaged in {
+        "wyoming.txt": [
+            second.replace("PRES", "PR#S"),
+            second.replace("Mar", "Mer"),
+            second.replace("Observations at 06Z", "Observations at 0?Z"),
+        ],
+        "igra.txt": [second.replace("2026", "20X6"), second.replace(" 06 0600", " 99 9999")],
+    }[name]:
+        text(path, "\n".join([first, damaged, third]))
+        used, words = damage(path)
+        assert used == left
+        begin = "UPM00033837 20" if name == "igra.txt" else "Observations at 0"
+        assert words.startswith("sounding 2: ")
+        assert f"it begins with '{begin}" in words
+        assert words.endswith("the rest of the file is used")
+        assert "substring" not in words
+        text(path, damaged)
+        with pytest.raises(AncillaryError, match=r"sounding 1: .*compare it with its origin"):
+            read(path)
+    # In Celsius by the file, but in K.
+    warm = TEXTS[name](times[1], 273.15)
+    used, words = damage(text(path, "\n".join([first, warm, warm, third])))
+    assert used == left
+    assert words.startswith("sounding of 2026-03-01T06:00Z: temperature: ")
+    assert ", and 1 more;" in words
+    assert damage(text(path, "\n".join([first, third]))) == (left, "")
+
+
+def test_levels_under_a_damaged_header_are_not_those_of_the_sounding_before(tmp_path: Path) -> None:
+    first, second, third = (
+        TEXTS["igra.txt"](NOON.replace(hour=hour), 10.0 * number)
+        for number, hour in enumerate((0, 6, 12))
+    )
+    path = text(tmp_path / "i.txt", "\n".join([first, second.replace("#", " "), third]))
+    used, words = damage(path)
+    assert used == [NOON]
+    assert words.startswith("sounding 1: has 35 levels, but states 17")
+
+
+def test_rows_with_other_numbers_of_cells_are_told(tmp_path: Path) -> None:
+    head, *rows = sounding_texts.wyoming_csv(NOON).splitlines()
+    rows[3] += ",1"
+    path = text(tmp_path / "s.csv", "\n".join([head, *rows]))
+    assert damage(path)[0] == [NOON]
+    assert damage(path)[1].startswith("row 5: has 9 values for 8 columns (give one value for each")
+    text(path, "\n".join([head, *(f"{row},1" for row in rows)]))
+    with pytest.raises(AncillaryError, match="row 2: has 9 values for 8 columns"):
+        read(path)
+
+
+@each(
+    "title, cell",
+    [
+        ("relative_humidity [%]", "50"),
+        ("relative_humidity_%", "50"),
+        ("dew_point [degC]", "-1.0"),
+        ("dew_point_C", "-1.0"),
+        ("specific_humidity [g/kg]", "5.0"),
+        ("mixing_ratio (g/kg)", "5.0"),
+        ("dew_point [degC],rh [%]", "-9999,50"),
+    ],
+)
+def test_units_stand_in_titles_of_two_words(tmp_path: Path, title: str, cell: str) -> None:
+    """Else the air would be dry without a word."""
+    rows = [
+        f"{p:.0f},{t:.2f},{z:.0f},{cell}" for z, p, t in zip(*sounding_texts.air(), strict=True)
+    ]
+    head = f"pressure [Pa],temperature [K],geopotential_height [m],{title}"
+    path = text(tmp_path / "s_2026.csv", "\n".join([head, *rows]))
+    (found,) = read(path, name_time="s_%Y.csv", **GIVEN)
+    check(found)
+    assert found.profile.water_vapour is not None
+    assert 0.004 < found.profile.water_vapour[0] < 0.01
+
+
+def test_rules_of_igra(tmp_path: Path) -> None:
+    """Hours of releases, temperatures below -88.8 degC, and the surface without height."""
+    path, whole = tmp_path / "i.txt", TEXTS["igra.txt"](NOON, 0.0)
+    for hour, release, day, clock in (
+        ("12", "1134", 1, (11, 34)),
+        ("00", "2315", 0, (23, 15)),
+        ("99", "2315", 1, (23, 15)),
+        ("23", "0008", 2, (0, 8)),
+        ("12", "1199", 1, (12, 0)),
+        ("12", "9999", 1, (12, 0)),
+    ):
+        text(path, whole.replace(" 12 1200", f" {hour} {release}"))
+        expected = datetime(2026, 3, 1, *clock, tzinfo=UTC) + timedelta(days=day - 1)
+        assert read(path)[0].time == expected
+    # Of the levels with a height, the last one is at -88.9 degC.
+    head, *rows = whole.splitlines()
+    rows[-1] = f"{rows[-1][:22]} -889{rows[-1][27:]}"
+    (found,) = read(text(path, "\n".join([head, *rows])))
+    assert found.profile.temperature[-1] == pytest.approx(184.25)
+    rows[0] = f"{rows[0][:16]}-9999{rows[0][21:]}"
+    (found,) = read(text(path, "\n".join([head, *rows])))
+    assert found.profile.altitude[0] == pytest.approx(HEIGHTS[0], abs=2.0)
+
+
+def test_rounded_pressures_bias_no_density(tmp_path: Path) -> None:
+    """Levels of 3 m, in whole hPa: of 38 levels at 20 km the lowest has too low a height."""
+    z = np.arange(100.0, 25_000.0, 3.0)
+    pressure, temperature = us_standard(z)
+    rows = [f"{a},{t},{p:.0f}" for a, t, p in zip(z, temperature, pressure / 100.0, strict=True)]
+    given = {"columns": ["altitude [m]", "temperature [K]", "pressure [hPa]"], **GIVEN}
+    path = text(tmp_path / "s_2026.csv", "\n".join(rows))
+    (found,) = read(path, name_time="s_%Y.csv", **given)
+    at = np.arange(1000.0, 20_001.0, 500.0)
+    expected = MolecularProfile.us_standard().number_density(at)
+    np.testing.assert_allclose(found.profile.number_density(at), expected, rtol=2e-3)
+
+
+@each(
+    "unit",
+    [
+        "hours since 2026-03-01 14:00:00 +02:00",
+        "hours since 2026-03-01T08:30:00.0-0330",
+        "minutes since 2026-03-01 12:00:00 0:00",
+        "days since 2026-03-01T12:00Z",
+        "seconds since 2026-03-01 07:00 -5",
+    ],
+)
+def test_times_of_netcdf_have_a_zone(tmp_path: Path, unit: str) -> None:
+    sounding_texts.arm(tmp_path / "a.nc", NOON)
+    since(tmp_path / "a.nc", unit)
+    assert read(tmp_path / "a.nc")[0].time == NOON
+
+
 def test_a_sounding_that_bursts_early_is_left_out(tmp_path: Path) -> None:
     """Of a file with others; the air above 3 km would be that of the standard atmosphere."""
     whole = TEXTS["igra.txt"](NOON, 0.0)
@@ -155,6 +328,26 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         "temperature: reaches from .* Celsius: add 273.15",
     ),
+    "with dew points in Celsius": (
+        lambda path: path.write_text(
+            sounding_texts.wyoming_csv(NOON).replace("dew point temperature_C", "dew_point")
+        ),
+        "dew_point: is 4.* K at most .*looks like Celsius: name the unit",
+    ),
+    "with decimal commas": (
+        lambda path: path.write_text(
+            sounding_texts.wyoming_csv(NOON).replace(",", ";").replace(".", ",")
+        ),
+        r"longitude: has a decimal comma: 30,7 \(write 30\.7\)",
+    ),
+    "with a zone that is not known": (
+        lambda path: (sounding_texts.arm(path, NOON), since(path, "hours since 2026-03-01 CET")),
+        "time: has the unit 'hours since 2026-03-01 CET'",
+    ),
+    "of several files": (
+        lambda path: pack(path, ("a.csv", "b.csv")),
+        r"holds 2 files: a\.csv, b\.csv \(pack each file alone",
+    ),
     "empty": (lambda path: path.write_text(""), "pressure: is missing"),
     "with a broken packing": (
         lambda path: path.write_bytes(gzip.compress(b"x" * 100)[:20]),
@@ -168,6 +361,21 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         "sfc_geopotential: is missing",
     ),
 }
+
+
+def pack(path: Path, names: tuple[str, ...]) -> None:
+    with zipfile.ZipFile(path, "w") as packed:
+        for name in names:
+            packed.writestr(name, sounding_texts.wyoming_csv(NOON))
+
+
+def since(path: Path, unit: str) -> None:
+    import xarray as xr
+
+    with xr.open_dataset(path, decode_times=False) as opened:
+        changed = opened.load()
+    changed["time"].attrs["units"] = unit
+    changed.to_netcdf(path)
 
 
 def drop(path: Path, name: str) -> None:

@@ -111,6 +111,8 @@ def test_plan_lists_nights_without_source_and_files_that_cannot_be_read(tmp_path
         (archive.folder / f"soundings/s{day:03d}_12.txt").unlink()
     (archive.folder / "soundings/s900.txt").write_text("no sounding\n")
     (archive.folder / "model/m000.gdas1").unlink()
+    good = archive.sounding(0).read_text()
+    archive.sounding(0).write_text(good + good.replace("01 Mar", "01 M?r"))
     archive.write()
     CliRunner().invoke(app, ["catalog", str(archive.file)])
     shown = CliRunner().invoke(app, ["plan", str(archive.file), "--json"])
@@ -126,7 +128,10 @@ def test_plan_lists_nights_without_source_and_files_that_cannot_be_read(tmp_path
     words = CliRunner().invoke(app, ["plan", str(archive.file)]).output
     assert "no source of the atmosphere" in words
     problems = {one["path"]: one["problem"] for one in document["unusable_files"]}
-    assert problems.keys() == {"soundings/s900.txt", "model/*.gdas1"}
+    damaged = "soundings/s000_12.txt"
+    assert problems.keys() == {"soundings/s900.txt", "model/*.gdas1", damaged}
+    assert problems[damaged].startswith("sounding 2: states no time; it begins with 'Observations")
+    assert problems[damaged].endswith("the rest of the file is used")
     assert "pressure: is missing" in problems["soundings/s900.txt"]
     assert problems["model/*.gdas1"] == "matches no file"
     assert shown.exit_code == 1

@@ -403,7 +403,7 @@ class MolecularProfile:
         """Return the air between two profiles, such as of two times.
 
         The logarithm of pressure, temperature and humidity are linear in the share, at the levels
-        of both.
+        of both. Humidity that only one of them states is that one's.
 
         Parameters
         ----------
@@ -413,10 +413,11 @@ class MolecularProfile:
         """
         altitude = np.union1d(self.altitude, other.altitude)
         (low, cold), (high, warm) = self.at(altitude), other.at(altitude)
+        humid = [one for one in (self, other) if one.water_vapour is not None]
         vapour = None
-        if self.water_vapour is not None or other.water_vapour is not None:
-            dry, humid = self.vapour(altitude), other.vapour(altitude)
-            vapour = (1.0 - share) * dry + share * humid
+        if humid:
+            first, last = humid[0].vapour(altitude), humid[-1].vapour(altitude)
+            vapour = (1.0 - share) * first + share * last
         return type(self)(
             altitude,
             np.exp((1.0 - share) * np.log(low) + share * np.log(high)),

@@ -252,3 +252,14 @@ def test_air_between_two_times_is_a_geometric_mean_of_pressures():
     expected = 0.75 * temperatures[0] + 0.25 * temperatures[1]
     np.testing.assert_allclose(temperature, expected, atol=0.05)
     assert not mixed.standard
+
+
+def test_humidity_that_one_of_two_profiles_states_is_that_of_the_air_between():
+    """Not a share of it: the other one is not dry."""
+    humid = _profile(water_vapour=np.array([0.03, 0.02, 0.01, 0, 0, 0, 0]))
+    z = humid.altitude
+    for mixed in (humid.mixed(_profile(), 0.25), _profile().mixed(humid, 0.25)):
+        np.testing.assert_allclose(mixed.vapour(z), humid.vapour(z))
+    wetter = _profile(water_vapour=3.0 * humid.vapour(z))
+    np.testing.assert_allclose(humid.mixed(wetter, 0.25).vapour(z), 1.5 * humid.vapour(z))
+    assert _profile().mixed(_profile(), 0.25).water_vapour is None
