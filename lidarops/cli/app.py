@@ -344,6 +344,7 @@ def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list
     return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]
 
 
+@_ending_with_a_line
 def stated(place: Path) -> Path:
     """Return the campaign file in a folder; without one the folder, and a file as it is."""
     file = place / CAMPAIGN_FILE

@@ -160,3 +160,20 @@ def test_a_dead_holder_whose_clock_was_a_day_ahead_is_shown_and_overtaken(
         assert invoke(archive, "catalog").exit_code == UNAVAILABLE
         monkeypatch.setattr(lock_module, "SILENCE", 1.0)
         assert invoke(archive, "catalog", "--wait", "20").exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["plan", "verify", "runs"])
+def test_a_folder_that_cannot_be_read_is_told_in_a_line(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    archive.write()
+
+    def broken(path: Path) -> NoReturn:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "is_file", broken)
+        result = CliRunner().invoke(app, [command, str(archive.folder)])
+    assert result.exit_code == UNAVAILABLE
+    assert "campaign.yaml: Input/output error" in result.output
+    assert isinstance(result.exception, SystemExit)
