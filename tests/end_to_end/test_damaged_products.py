@@ -57,7 +57,6 @@ def _draw(products: Sequence[Path], rng: random.Random, number: int) -> dict[Pat
     return drawn
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [1, pytest.param(17, marks=pytest.mark.slow)])
 def test_commands_state_a_damaged_product_in_one_line(
     finished: Path, tmp_path: Path, rounds: int

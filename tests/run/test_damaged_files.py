@@ -157,7 +157,6 @@ def _damaged_at_random(archive: Archive, days: int) -> dict[str, tuple[bytes, Da
     return held
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("days", [12, pytest.param(60, marks=pytest.mark.slow)])
 def test_what_random_damage_leaves_is_made_and_what_it_takes_is_stated(
     tmp_path: Path, days: int

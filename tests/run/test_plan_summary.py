@@ -184,7 +184,6 @@ def without_usable_values(job: Job) -> tuple[SceneOutcome, bool]:
     return replace(outcome, products=products), counted
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 160])
 @pytest.mark.parametrize("days", [24, pytest.param(330, marks=pytest.mark.slow)])
 def test_scenes_that_all_differ_fill_a_screen_or_two(

@@ -604,7 +604,6 @@ def test_impossible_arguments_are_refused_by_name(change, field):
 # Outlying bins ------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("window", [True, False], ids=["in the window", "elsewhere"])
 @pytest.mark.parametrize("size", [30.0, 1000.0, -1000.0])
 def test_errors_hold_with_an_outlying_bin(window, size):
