@@ -57,6 +57,11 @@ def products(folder: Path, **source: Any) -> tuple[Campaign, dict[str, xr.Datase
     return campaign, {kind: xr.load_dataset(paths[kind]) for kind in BITS}
 
 
+def grid(product: xr.Dataset) -> dict[str, Any]:
+    """Return what products that are joined along time have in common."""
+    return {str(name): (one.dims, one.dtype) for name, one in product.variables.items()}
+
+
 @pytest.mark.slow
 def test_nights_without_source_are_told_and_flagged(folder: Path) -> None:
     _, without = products(folder)
@@ -66,8 +71,8 @@ def test_nights_without_source_are_told_and_flagged(folder: Path) -> None:
         product = made[kind]
         assert (product[SOURCE].item(), without[kind][SOURCE].item()) == (0, 0)
         assert product["molecular_density_relative_error"].item() == pytest.approx(0.03)
-        assert "molecular_profile_age" not in product
-        assert "molecular_density_relative_error" not in without[kind]
+        assert np.isnan(product["molecular_profile_age"].item())
+        assert without[kind]["molecular_density_relative_error"].item() == pytest.approx(0.01)
         flags = [name for name in product if str(name).endswith("quality_flag")]
         for name in flags:
             assert np.all(product[name] & np.int32(bit))
@@ -85,6 +90,13 @@ def test_errors_follow_from_source_and_age(folder: Path) -> None:
     for kind, product in near.items():
         assert product[SOURCE].item() == 1
         assert product["molecular_profile_age"].item() == 7200.0
+        # Nights with and without a source are one series.
+        assert grid(product) == grid(without[kind])
+        above = product["altitude"] > sounding_texts.HEIGHTS[-1] + 100.0
+        for name in (name for name in product if str(name).endswith("quality_flag")):
+            flagged = (product[name] & np.int32(BITS[kind])) != 0
+            assert bool(flagged.sel(altitude=above).all())
+            assert not bool(flagged.sel(altitude=product["altitude"] < 13_000.0).any())
         assert product["molecular_profile_distance"].item() == pytest.approx(7470.0, abs=50.0)
         stated = product["molecular_density_relative_error"].item()
         assert stated == pytest.approx(error, rel=5e-3)
