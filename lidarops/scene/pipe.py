@@ -484,10 +484,10 @@ def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> PlannedStep:
     return case.run(AIR, "all sources are too far in time or place", settings, warning=warning)
 
 
-def with_air_error(entry: Entry, molecular: PlannedStep) -> Entry:
+def with_air_error(entry: Entry, error: float) -> Entry:
     """Return the entry of a product with the error of the density that counts: that of sources."""
-    key, error = "molecular_relative_error", molecular.settings.get("relative_error")
-    if isinstance(entry, LeftOut) or key not in entry.settings or error is None:
+    key = "molecular_relative_error"
+    if isinstance(entry, LeftOut) or key not in entry.settings:
         return entry
     reason = f"{entry.reason}; {key} is that of atmosphere, not that of the product"
     return replace(entry, settings={**entry.settings, key: error}, reason=reason)

@@ -235,7 +235,9 @@ def _channel_entries(case: ChannelCase[Any], air: AirFiles | None) -> list[Entry
     if not any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep)):
         return [*stages, *products]
     molecular = plan_molecular(case, air)
-    return [*stages, molecular, *(with_air_error(entry, molecular) for entry in products)]
+    if (error := molecular.settings.get("relative_error")) is not None:
+        products = [with_air_error(entry, error) for entry in products]
+    return [*stages, molecular, *products]
 
 
 def _linked(entries: Sequence[Entry]) -> list[Entry]:

@@ -115,3 +115,8 @@ def test_errors_follow_from_source_and_age(folder: Path) -> None:
         assert float(ratio.median()) == pytest.approx(expected, rel=0.1)
         result = reproduce_product(path, archive=campaign.archive, ancillary=folder)
         assert result.identical, result.differences
+        lost = (folder / "s6.csv").rename(folder / "s6.lost")
+        (difference,) = reproduce_product(path, archive=campaign.archive).differences
+        lost.rename(folder / "s6.csv")
+        assert difference.name == "s6.csv"
+        assert "--ancillary" in difference.problem
