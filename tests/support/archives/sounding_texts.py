@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidarops.retrieve.air.molecular import us_standard
 
-HEIGHTS = np.arange(100.0, 14_000.0, 700.0)
+HEIGHTS = np.arange(100.0, 12_000.0, 700.0)
 LATITUDE, LONGITUDE = 46.4, 30.7
 
 
