@@ -25,7 +25,7 @@ PLACES: Final = 31
 
 STANDARD_AIR: Final = (
     "the air is the standard atmosphere, because no source of the campaign holds a profile near"
-    " enough in time and place"
+    " enough in time and place, or above the top of the profile"
 )
 """Description of a bit of kinds that need the density of the air."""
 

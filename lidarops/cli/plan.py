@@ -33,7 +33,7 @@ from lidarops.cli.app import (
     show_tables,
     wrapped,
 )
-from lidarops.figures.wording import counted
+from lidarops.figures.wording import counted, listed
 from lidarops.kinds import kinds
 from lidarops.records import without_numbers
 
@@ -353,14 +353,19 @@ def _block(group: Sequence[Judgement], shown: Shown) -> list[str]:
     granules, dark = (sum(map(len, part)) for part in files)
     memory = max(_memory(j)["to_be_made" if shown.stale else "everything"] for j in group)
     title += f"{granules} files, {dark} dark, about {memory / 1e6:.0f} MB of memory"
-    alike: dict[str, dict[str, list[str]]] = {}
-    for line in (line for judged in group for line in _scene_lines(judged, plan=not shown.stale)):
-        kinds_of_line = alike.setdefault(line.partition(":")[0], {})
-        kinds_of_line.setdefault(_NUMBER.sub("#", line), []).append(line)
+    alike: dict[str, dict[str, list[tuple[str, datetime]]]] = {}
+    for judged in group:
+        for line in _scene_lines(judged, plan=not shown.stale):
+            kinds_of_line = alike.setdefault(line.partition(":")[0], {})
+            here = line, judged.scene.start
+            kinds_of_line.setdefault(_NUMBER.sub("#", line), []).append(here)
     lines = []
-    for said in (said for kinds_of_line in alike.values() for said in kinds_of_line.values()):
+    for told in (told for kinds_of_line in alike.values() for told in kinds_of_line.values()):
+        said, starts = zip(*told, strict=True)
         others = ", and the like" if len(set(said)) > 1 else ""
         share = f" ({len(said)} of {len(group)} scenes)" if len(said) < len(group) else ""
+        if share and said[0].startswith("warning"):
+            share = f"{share[:-1]}: {listed({f'{start:%Y-%m-%d}' for start in starts})})"
         lines.append(f"{said[0]}{others}{share}")
     return [title, *lines]
 

@@ -673,14 +673,11 @@ MOLECULAR_SOURCE: Final = coded(
     "As in files of EARLINET. radiosounding: also any file that molecular_profile names."
     " icon-iglo-12-23: any run of ICON. provenance names the files.",
 )
-_SOURCES: Final = (
-    "Missing where the campaign gives no sources of the air; age and distance also where none of"
-    " them holds."
-)
+_SOURCES: Final = "Age and distance are missing where no source of the campaign gives the air."
 MOLECULES: Final = (
     MOLECULAR_SOURCE,
     *(
-        per_profile(f"molecular_{name}", words, _SOURCES, dims=(), optional=True, units=units)
+        per_profile(f"molecular_{name}", words, _SOURCES, dims=(), units=units)
         for name, words, units in (
             ("profile_age", "time from the middle of the scene to the nearest profile of air", "s"),
             ("profile_distance", "distance of the farthest profile of air from the station", "m"),

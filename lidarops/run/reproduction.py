@@ -372,7 +372,8 @@ def reproduce_product(
         ancillaries = root
         if others:
             ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog))
-        changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
+        place_of_others = f"{ancillaries} (give the folder that holds it with --ancillary)"
+        changed = [*wrong, *_changed(ancillaries, others, place_of_others)]
         changed += _changed(products, read, str(products))
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))

@@ -12,7 +12,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import asin, cos, radians, sin, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -71,6 +71,7 @@ class ChosenAir(SettingsModel):
     place: tuple[float, float]
     """Latitude and longitude of the station, degree."""
     age: float = quantity(unit="s", description="from the middle to the nearest profile")
+    top: float = quantity(unit="m", description="above sea level, of the lower of the profiles")
     reading: AtmosphereReading
 
     @property
@@ -85,19 +86,42 @@ class ChosenAir(SettingsModel):
         )
         return (
             f"molecular: {self.origin}, {' and '.join(parts)}, for {self.time:%Y-%m-%dT%H:%MZ};"
-            f" age {self.age / 3600.0:.3g} h, distance {self.distance / 1000.0:.3g} km, relative"
-            f" error of density {error:.2g}"
+            f" age {self.age / 3600.0:.3g} h, distance {self.distance / 1000.0:.3g} km, up to"
+            f" {self.top / 1000.0:.3g} km, relative error of density {error:.2g}"
         )
 
     def profile(self, folder: Path) -> MolecularProfile:
         """Read the air of the scene from the files below the folder of the campaign file."""
-        from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
-
+        reading = self.reading.model_dump_json()
         first, *others = (
-            soundings(folder, one.file, self.reading, self.place)[one.number].profile
+            _parsed(folder, one.file, _changed(folder / one.file), reading, self.place)[one.number]
             for one in self.profiles
         )
         return first.mixed(others[0], self.profiles[1].share) if others else first
+
+
+@lru_cache(maxsize=2)
+def _parsed(
+    folder: Path,
+    name: str,
+    changed: tuple[int, int],  # noqa: ARG001 - another file is read again
+    reading: str,
+    place: tuple[float, float],
+) -> tuple[MolecularProfile, ...]:
+    """Return the profiles of a file, which many channels and scenes may need."""
+    from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
+
+    stated = AtmosphereReading.model_validate_json(reading)
+    return tuple(one.profile for one in soundings(folder, name, stated, place))
+
+
+def _changed(path: Path) -> tuple[int, int]:
+    """Return size and modification time of a file; -1 where only reading it tells the problem."""
+    try:
+        status = os.stat(path)  # noqa: PTH116 - for each file, a Path is slow
+    except OSError:
+        return -1, -1
+    return status.st_size, status.st_mtime_ns
 
 
 class _Found(NamedTuple):
@@ -109,6 +133,8 @@ class _Found(NamedTuple):
     latitude: float
     longitude: float
     origin: str
+    top: float
+    """m above sea level."""
 
 
 _File = tuple[str, int, int]
@@ -161,7 +187,9 @@ class AirFiles:
             if not files:
                 told[", ".join(source.files)] = "matches no file"
             for file in files:
-                key = digest([file, reading.model_dump(mode="json"), place, version])
+                key = digest(
+                    [file, reading.model_dump(mode="json"), place, version, _Found._fields]
+                )
                 used[key] = known.get(key) or _read(self._campaign.folder, file[0], reading, place)
                 rows, problem = used[key]
                 profiles += [_Found(datetime.fromisoformat(time), *row) for time, *row in rows]
@@ -186,10 +214,11 @@ class AirFiles:
         """Return whether the campaign gives sources for a station."""
         return bool(self._campaign.atmosphere.get(station))
 
-    def of_scene(self, scene: Scene) -> tuple[ChosenAir, float] | None:
+    def of_scene(self, scene: Scene, height: float = 0.0) -> tuple[ChosenAir, float] | None:
         """Return the air of a scene, and the relative error of its density.
 
-        By the first source that holds; None where none does.
+        By the first source that holds; None where none does. Where the profiles end below a height
+        above the station, in m, the error is that of the standard atmosphere or larger.
         """
         starts = [granule.start for granule in scene.granules if granule.start]
         stops = [granule.stop or granule.start for granule in scene.granules if granule.start]
@@ -199,7 +228,9 @@ class AirFiles:
             source, place = self._source(scene.station, number)
             near = _near(profiles, begin + length / 2, source, place)
             if near:
-                return _chosen(near, begin + length / 2, length, source, place)
+                air, error = _chosen(near, begin + length / 2, length, source, place)
+                needed = self._campaign.stations[scene.station].altitude + height
+                return air, error if air.top >= needed else max(error, STANDARD_ERROR)
         return None
 
 
@@ -248,16 +279,18 @@ def _chosen(
                 number=one.number,
                 time=one.time,
                 distance=round(distance),
-                share=share,
+                share=round(share, 6),
             )
             for (distance, one), share in zip(near, shares, strict=True)
         ],
         time=time,
         place=place,
-        age=min(hours) * 3600.0,
+        age=round(min(hours) * 3600.0),
+        top=min(one.top for _, one in near),
         reading=AtmosphereReading.taken_from(source),
     )
-    return air, float(f"{min(sqrt(variance), STANDARD_ERROR):.3g}")
+    # What is stated holds, also above that of the standard atmosphere.
+    return air, float(f"{min(sqrt(variance), max(own, STANDARD_ERROR)):.3g}")
 
 
 def _distance(one: _Found, place: tuple[float, float]) -> float:
@@ -270,22 +303,19 @@ def _distance(one: _Found, place: tuple[float, float]) -> float:
 def _files(folder: Path, source: AtmosphereSource) -> Iterator[_File]:
     """Yield the files that a source names, by path."""
     matches = path_matcher(source.files)
-    # Nothing is listed beside the folders that the patterns name.
-    tops = {"/".join(part for part in _plain_parts(pattern)[:-1]) for pattern in source.files}
-    paths = {
-        os.path.relpath(f"{top}/{name}", folder)
-        for start in tops
-        for top, _, names in os.walk(folder / start, followlinks=True)
-        for name in names
-    }
+    paths = {path for pattern in source.files for path in _paths(folder, pattern)}
     for path in sorted(filter(matches, paths)):
-        try:
-            status = os.stat(folder / path)  # noqa: PTH116 - for each file, a Path is slow
-        except OSError:
-            # Reading it tells the problem.
-            yield path, -1, -1
-            continue
-        yield path, status.st_size, status.st_mtime_ns
+        yield path, *_changed(folder / path)
+
+
+def _paths(folder: Path, pattern: str) -> Iterator[str]:
+    """Yield the files of the folders that a pattern names; as in an archive, not behind links."""
+    start = "/".join(_plain_parts(pattern)[:-1])
+    for top, folders, names in os.walk(folder / start):
+        inside = os.path.relpath(f"{top}/name", folder).removesuffix("name")
+        if "**" not in pattern and inside.count("/") >= pattern.count("/"):
+            folders.clear()
+        yield from (f"{inside}{name}" for name in names)
 
 
 def _plain_parts(pattern: str) -> list[str]:
@@ -305,9 +335,10 @@ def _read(
         read, problem = read_soundings(folder, name, reading, place)
     except AncillaryError as error:
         return [], str(error).removeprefix(f"{name}: ")
+    tops = (round(float(one.profile.altitude[-1])) for one in read)
     return [
-        [one.time.isoformat(), name, number, one.latitude, one.longitude, one.origin]
-        for number, one in enumerate(read)
+        [one.time.isoformat(), name, number, one.latitude, one.longitude, one.origin, top]
+        for number, (one, top) in enumerate(zip(read, tops, strict=True))
     ], problem
 
 

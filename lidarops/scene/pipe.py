@@ -10,6 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from typing import Any, Final, Literal, cast
@@ -460,7 +461,7 @@ class MolecularSettings(SettingsModel):
     """
 
 
-def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
+def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> PlannedStep:
     """Give the density of the air, of a file, of sources or of the standard atmosphere."""
     if source := case.facts.molecular_profile:
         settings = MolecularSettings(molecular_profile=source)
@@ -468,7 +469,9 @@ def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
     if air is None or not air.is_given(case.scene.station):
         reason = "the campaign gives neither molecular_profile nor atmosphere; US Standard"
         return case.run(AIR, f"{reason} Atmosphere 1976 is used", MolecularSettings())
-    chosen = air.of_scene(case.scene)
+    windows = (getattr(request, "reference", None) for request in case.requests.values())
+    highest = max((window.highest for window in windows if window), default=0.0)
+    chosen = air.of_scene(case.scene, min(highest, case.last))
     if chosen is not None:
         reason = "nearest profiles of the first source of the atmosphere that holds"
         settings = MolecularSettings(atmosphere=chosen[0], relative_error=chosen[1])
@@ -479,6 +482,15 @@ def plan_molecular(case: ChannelCase[Any], air: AirFiles | None) -> Entry:
     )
     settings = MolecularSettings(relative_error=STANDARD_ERROR)
     return case.run(AIR, "all sources are too far in time or place", settings, warning=warning)
+
+
+def with_air_error(entry: Entry, error: float) -> Entry:
+    """Return the entry of a product with the error of the density that counts: that of sources."""
+    key = "molecular_relative_error"
+    if isinstance(entry, LeftOut) or key not in entry.settings:
+        return entry
+    reason = f"{entry.reason}; {key} is that of atmosphere, not that of the product"
+    return replace(entry, settings={**entry.settings, key: error}, reason=reason)
 
 
 _OF_FILES: Final = (plan_overlap, plan_range_offset, plan_dark, plan_dead_time, plan_noise)

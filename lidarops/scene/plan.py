@@ -46,7 +46,7 @@ from lidarops.scene.case import (
     product_channel,
 )
 from lidarops.scene.dependence import ProductKey, places_by_need, scene_facts
-from lidarops.scene.pipe import AIR, plan_molecular, plan_stages
+from lidarops.scene.pipe import AIR, plan_molecular, plan_stages, with_air_error
 from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, Retrieval, making
 from lidarops.settings import ChannelProduct
 
@@ -232,8 +232,12 @@ def _channel_entries(case: ChannelCase[Any], air: AirFiles | None) -> list[Entry
             products += making(kind.name, Retrieval).needs(own)
         elif not kind.reads:
             products.append(own.leave(kind.name, NOT_REQUESTED, rule=REQUEST))
-    needed = any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep))
-    return [*stages, *([plan_molecular(case, air)] if needed else []), *products]
+    if not any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep)):
+        return [*stages, *products]
+    molecular = plan_molecular(case, air)
+    if (error := molecular.settings.get("relative_error")) is not None:
+        products = [with_air_error(entry, error) for entry in products]
+    return [*stages, molecular, *products]
 
 
 def _linked(entries: Sequence[Entry]) -> list[Entry]:

@@ -242,7 +242,12 @@ def settings_model(step: PlannedStep) -> Any:
 
 
 def with_methods(
-    product: xr.Dataset, signal: ChannelSignal, standard_air: FlagBit, *, known_shape: bool
+    product: xr.Dataset,
+    signal: ChannelSignal,
+    standard_air: FlagBit,
+    air_error: float,
+    *,
+    known_shape: bool,
 ) -> xr.Dataset:
     """Return the product with its air, and method and papers of its backgrounds.
 
@@ -251,7 +256,9 @@ def with_methods(
     product : xr.Dataset
     signal : ChannelSignal
     standard_air : FlagBit
-        Bit of all values where the standard atmosphere stands for the sources of the campaign.
+        Bit of values where the standard atmosphere stands for the sources of the campaign.
+    air_error : float
+        Relative standard error of the density of the air.
     known_shape : bool
         Whether the background is fitted with the shape of the signal of clean air.
     """
@@ -260,18 +267,21 @@ def with_methods(
     if method == "known_shape":
         product = product.assign_attrs(references=KNOWN_SHAPE_PAPERS)
     air, states = signal.air, MOLECULAR_SOURCE.states
-    if air is None and signal.air_error is not None:
+    if signal.air_error is not None:
         names = [str(name) for name in product if str(name).endswith(QUALITY_FLAG)]
-        product = product.assign({name: product[name] | np.int32(standard_air) for name in names})
+        climb = np.cos(np.deg2rad(signal.source.pointing["zenith_angle"]))
+        altitude = signal.source.station_altitude + climb * product["range"]
+        bits = (altitude > (air.top if air else -np.inf)) * np.int32(standard_air)
+        product = product.assign({name: product[name] | bits for name in names})
     origin = air.origin if air else states[0 if signal.molecules.standard else 1]
     stated = {
-        "molecular_profile_age": air.age if air else None,
-        "molecular_profile_distance": air.distance if air else None,
-        "molecular_density_relative_error": signal.air_error,
+        "molecular_profile_age": air.age if air else np.nan,
+        "molecular_profile_distance": air.distance if air else np.nan,
+        "molecular_density_relative_error": air_error,
         MOLECULAR_SOURCE.name: [state.startswith(origin) for state in states].index(True),
         "background_method": BACKGROUND_METHOD.code(method),
     }
-    return product.assign({key: value for key, value in stated.items() if value is not None})
+    return product.assign(stated)
 
 
 def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:

@@ -34,6 +34,10 @@ def folder(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     tree = yaml.safe_load((repository / "catalogs/raman.yaml").read_text())
     tree |= {"archive": "raw", "output": "out"}
     tree["simulation"] |= {"duration": 3600}
+    for instrument in tree["instruments"].values():
+        for kind in BITS:
+            # Below the top of the soundings.
+            instrument["products"][kind].setdefault("reference", {})["highest"] = 10_000
     (folder / "campaign.yaml").write_text(yaml.safe_dump(tree))
     simulate_campaign(load_campaign(folder / "campaign.yaml"))
     for hours in (-2, 6):
@@ -57,7 +61,11 @@ def products(folder: Path, **source: Any) -> tuple[Campaign, dict[str, xr.Datase
     return campaign, {kind: xr.load_dataset(paths[kind]) for kind in BITS}
 
 
-@pytest.mark.slow
+def grid(product: xr.Dataset) -> dict[str, Any]:
+    """Return what products that are joined along time have in common."""
+    return {str(name): (one.dims, one.dtype) for name, one in product.variables.items()}
+
+
 def test_nights_without_source_are_told_and_flagged(folder: Path) -> None:
     _, without = products(folder)
     _, made = products(folder, files="s*.csv", greatest_age="1h")
@@ -66,8 +74,8 @@ def test_nights_without_source_are_told_and_flagged(folder: Path) -> None:
         product = made[kind]
         assert (product[SOURCE].item(), without[kind][SOURCE].item()) == (0, 0)
         assert product["molecular_density_relative_error"].item() == pytest.approx(0.03)
-        assert "molecular_profile_age" not in product
-        assert "molecular_density_relative_error" not in without[kind]
+        assert np.isnan(product["molecular_profile_age"].item())
+        assert without[kind]["molecular_density_relative_error"].item() == pytest.approx(0.01)
         flags = [name for name in product if str(name).endswith("quality_flag")]
         for name in flags:
             assert np.all(product[name] & np.int32(bit))
@@ -77,7 +85,6 @@ def test_nights_without_source_are_told_and_flagged(folder: Path) -> None:
             assert product[judge].attrs["flag_meanings"].endswith("standard_air")
 
 
-@pytest.mark.slow
 def test_errors_follow_from_source_and_age(folder: Path) -> None:
     _, without = products(folder)
     campaign, near = products(folder, files="s*.csv")
@@ -85,6 +92,15 @@ def test_errors_follow_from_source_and_age(folder: Path) -> None:
     for kind, product in near.items():
         assert product[SOURCE].item() == 1
         assert product["molecular_profile_age"].item() == 7200.0
+        # Nights with and without a source are one series.
+        assert grid(product) == grid(without[kind])
+        above = product["altitude"] > sounding_texts.HEIGHTS[-1] + 100.0
+        for name in (name for name in product if str(name).endswith("quality_flag")):
+            flagged = (product[name] & np.int32(BITS[kind])) != 0
+            assert bool(flagged.sel(altitude=above).all())
+            assert not bool(
+                flagged.sel(altitude=product["altitude"] < sounding_texts.HEIGHTS[-1]).any()
+            )
         assert product["molecular_profile_distance"].item() == pytest.approx(7470.0, abs=50.0)
         stated = product["molecular_density_relative_error"].item()
         assert stated == pytest.approx(error, rel=5e-3)
@@ -103,3 +119,8 @@ def test_errors_follow_from_source_and_age(folder: Path) -> None:
         assert float(ratio.median()) == pytest.approx(expected, rel=0.1)
         result = reproduce_product(path, archive=campaign.archive, ancillary=folder)
         assert result.identical, result.differences
+        lost = (folder / "s6.csv").rename(folder / "s6.lost")
+        (difference,) = reproduce_product(path, archive=campaign.archive).differences
+        lost.rename(folder / "s6.csv")
+        assert difference.name == "s6.csv"
+        assert "--ancillary" in difference.problem

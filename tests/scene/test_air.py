@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -114,6 +116,46 @@ def test_the_error_grows_with_the_distance_in_time(
     expected = np.sqrt(0.01**2 + GROWTH**2 * variance)
     error = error_of(campaign(tmp_path, {**SONDES, "relative_error": 0.01}), length)
     assert error == pytest.approx(expected, rel=5e-3)
+    # A stated error holds beyond that of the standard atmosphere.
+    assert error_of(campaign(tmp_path, {**SONDES, "relative_error": 0.1}), length) == 0.1
+
+
+def test_above_the_top_of_the_profile_the_error_is_that_of_the_standard_atmosphere(
+    tmp_path: Path,
+) -> None:
+    sonde(tmp_path, -1.0)
+    given = campaign(tmp_path, SONDES)
+    air = chosen(given)
+    assert air is not None
+    assert air.top == round(float(altitude_of(sounding_texts.HEIGHTS[-1], LATITUDE)))
+    height = air.top - next(iter(given.stations.values())).altitude
+    errors = [AirFiles(given).of_scene(scene_of(given), at) for at in (height, height + 1.0)]
+    assert [found and found[1] for found in errors] == [error_of(given, 0.0), STANDARD_ERROR]
+
+
+def test_products_state_the_error_that_counts(tmp_path: Path) -> None:
+    sonde(tmp_path, 0.0)
+    campaign(tmp_path, SONDES, zenith_angle=0)
+    tree = yaml.safe_load((tmp_path / "campaign.yaml").read_text())
+    for highest, expected in ((9000, SOURCE_ERROR), (20_000, STANDARD_ERROR)):
+        for instrument in tree["instruments"].values():
+            reference = {"lowest": 1000, "highest": highest}
+            instrument["products"] = {
+                "elastic": {"channels": ["analog_532o"], "reference": reference}
+            }
+        (tmp_path / "campaign.yaml").write_text(yaml.safe_dump(tree))
+        given = load_campaign(tmp_path / "campaign.yaml")
+        steps = plan_scene(scene_of(given), given).steps
+        (step,) = (step for step in steps if step.name == "elastic")
+        assert step.settings["molecular_relative_error"] == expected
+        assert "that of atmosphere" in step.reason
+
+
+def test_plans_hold_whole_seconds(tmp_path: Path) -> None:
+    sonde(tmp_path, -13.0 / 3.0)
+    air = chosen(campaign(tmp_path, SONDES))
+    assert air is not None
+    assert air.age == 15_600.0
 
 
 def test_the_first_source_that_holds_counts(tmp_path: Path) -> None:
@@ -145,6 +187,59 @@ def test_the_nearest_place_counts_within_the_greatest_distance(tmp_path: Path) -
     air = chosen(campaign(tmp_path, {**SONDES, "greatest_distance": 160_000}))
     assert air is not None
     assert [one.file for one in air.profiles] == [far]
+
+
+def test_folders_are_walked_as_those_of_an_archive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither behind links, nor deeper than a pattern reaches."""
+    folder = tmp_path / "sondes"
+    (folder / "deep/deeper").mkdir(parents=True)
+    name = sonde(folder, -1.0)
+    for link in "ab":
+        (folder / link).symlink_to(".")
+    walked: list[str] = []
+    walk = os.walk
+
+    def counted(*given: Any, **more: Any) -> Iterator[Any]:
+        for step in walk(*given, **more):
+            walked.append(os.path.relpath(step[0], tmp_path))
+            assert len(walked) < 20
+            yield step
+
+    monkeypatch.setattr(os, "walk", counted)
+    whole = ["sondes", "sondes/deep", "sondes/deep/deeper"]
+    found = f"sondes/{name}"
+    for pattern, file, folders in (
+        ("sondes/*.csv", found, whole[:1]),
+        ("sondes/**/*.csv", found, whole),
+        ("sondes/*/*.csv", None, whole[:2]),
+    ):
+        walked.clear()
+        air = chosen(campaign(tmp_path, {"files": pattern}))
+        assert (air and air.profiles[0].file) == file
+        assert walked == folders
+
+
+def test_a_file_is_read_once_for_all_channels_and_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = sonde(tmp_path, -1.0)
+    air = chosen(campaign(tmp_path, SONDES))
+    assert air is not None
+    read: list[str] = []
+
+    def reading(folder: Path, file: str, *given: Any) -> Any:
+        read.append(file)
+        return soundings(folder, file, *given)
+
+    monkeypatch.setattr("lidarops.campaign.soundings.soundings", reading)
+    before = [air.profile(tmp_path).at(5000.0)[1] for _ in range(3)]
+    assert read == [name]
+    # Unless it changes.
+    sonde(tmp_path, -1.0, shift=8.0)
+    os.utime(tmp_path / name, (0, 0))
+    assert air.profile(tmp_path).at(5000.0)[1] > before[0] + 5.0
 
 
 def test_the_profile_of_the_facts_counts_before_sources(tmp_path: Path) -> None:

@@ -127,6 +127,7 @@ def test_plan_lists_nights_without_source_and_files_that_cannot_be_read(tmp_path
     assert without == {"rich_20250304T000000"}
     words = CliRunner().invoke(app, ["plan", str(archive.file)]).output
     assert "no source of the atmosphere" in words
+    assert "(1 of 6 scenes: 2025-03-04)" in " ".join(words.split())
     problems = {one["path"]: one["problem"] for one in document["unusable_files"]}
     damaged = "soundings/s000_12.txt"
     assert problems.keys() == {"soundings/s900.txt", "model/*.gdas1", damaged}

@@ -36,8 +36,8 @@ class ElasticAssumptions(SettingsModel):
         unit="1",
         ge=0,
         le=1,
-        description="standard error of the density of the air, relative; of atmosphere, that of its"
-        " source and age",
+        description="standard error of the density of the air, relative; does not count where the"
+        " campaign gives atmosphere: that of its source and age does",
     )
     least_signal_to_noise: float = signal_to_noise_limit()
 

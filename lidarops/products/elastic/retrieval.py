@@ -129,14 +129,13 @@ class _Inversion(ProductStream):
 
     def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
         signal, settings = self._signal, self._settings
-        error = settings.molecular_relative_error if signal.air_error is None else signal.air_error
         inverted = labeled.invert_elastic(
             averages.assign_coords(signal.source.pointing),
             molecules=signal.molecules,
             wavelength=signal.wavelength,
             station_altitude=signal.source.station_altitude,
             lidar_ratio=self._lidar_ratio,
-            molecular_relative_error=error,
+            molecular_relative_error=settings.molecular_relative_error,
             reference=self._reference,
             known_shape=self._known_shape,
             overlap=signal.overlap_at(averages["range"].to_numpy()),
@@ -145,8 +144,8 @@ class _Inversion(ProductStream):
         least = settings.least_signal_to_noise
         flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
         glued = flagged.assign(gluing(averages))
-        bit = ElasticQuality.STANDARD_AIR
-        return with_methods(glued, signal, bit, known_shape=self._known_shape)
+        bit, error = ElasticQuality.STANDARD_AIR, settings.molecular_relative_error
+        return with_methods(glued, signal, bit, error, known_shape=self._known_shape)
 
 
 RETRIEVAL: Final = Retrieval(settings=ElasticPlan, needs=_needs, stream=_Inversion, held=_held)

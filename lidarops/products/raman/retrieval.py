@@ -168,10 +168,7 @@ class _Retrieval(ProductStream):
         self._settings, self._signal = settings.raman, signal
         if (error := signal.air_error) is not None:
             slope = settings.raman.molecular_slope_error
-            changes = {
-                "molecular_relative_error": error,
-                "molecular_slope_error": SLOPE * error if slope is None else slope,
-            }
+            changes = {"molecular_slope_error": SLOPE * error if slope is None else slope}
             self._settings = settings.raman.model_copy(update=changes)
         names = [signal.channel, *settings.raman.channels]
         highest = settings.raman.reference.highest * settings.raman.stretch
@@ -204,8 +201,8 @@ class _Retrieval(ProductStream):
         )
         weighed = [name for name in LAYOUT.weighed if name in retrieved]
         flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
-        bit = RamanQuality.STANDARD_AIR
-        return with_methods(flagged, signal, bit, known_shape=settings.known_shape)
+        bit, error = RamanQuality.STANDARD_AIR, settings.molecular_relative_error
+        return with_methods(flagged, signal, bit, error, known_shape=settings.known_shape)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings

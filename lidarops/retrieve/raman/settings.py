@@ -50,8 +50,8 @@ class RamanSettings:
             unit="1",
             ge=0,
             le=1,
-            description="standard error of the density of the air, relative; of atmosphere, that of"
-            " its source and age",
+            description="standard error of the density of the air, relative; does not count where"
+            " the campaign gives atmosphere: that of its source and age does",
         ),
     ] = 0.01
     molecular_slope_error: Annotated[
