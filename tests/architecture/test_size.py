@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_907,
-    "lines of code alone": 46_394,
+    "lines": 71_161,
+    "lines of code alone": 46_578,
     "modules": 270,
     "dataclasses": 220,
-    "lines of dataclasses": 6_190,
-    "tuning numbers": 164,
+    "lines of dataclasses": 6_191,
+    "tuning numbers": 166,
     "tuning numbers that are assumed": 44,
     "copied thresholds": 0,
     "most parameters": 10,
@@ -31,7 +31,7 @@ MOST = {
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 582, "changes": 243},
-    "elastic": {"modules": 70, "functions": 717, "changes": 253},
+    "elastic": {"modules": 71, "functions": 717, "changes": 253},
 }
 
 
