@@ -481,7 +481,7 @@ def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
 
 def _orphan_table(result: Result, fate: str) -> Table:
     rows = ((orphan.path, orphan.reason) for orphan in result.orphans if not orphan.requested)
-    return f"Products that the campaign no longer requests ({fate})", ("file", "reason"), rows
+    return f"Products that would not be made again ({fate})", ("file", "reason"), rows
 
 
 def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str]]:
