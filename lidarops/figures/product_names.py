@@ -22,13 +22,18 @@ def attribute(product: xr.Dataset | StoredProduct, name: str, default: str = UNK
 
 
 def light_in_words(product: xr.Dataset) -> str:
-    """Return wavelength and detection of the channel in words; empty if unknown."""
+    """Return wavelength, detection and name of the channel in words; empty if unknown.
+
+    The name tells polarisations and telescopes apart.
+    """
     wavelength = scalar(product, "wavelength")
     units = "" if wavelength is None else product.variables["wavelength"].attrs["units"]
     words = "" if wavelength is None else f"{wavelength:g} {units}"
-    glued = is_glued(attribute(product, "lidarops_channel"))
+    channel = attribute(product, "lidarops_channel", "")
+    glued = is_glued(channel)
     mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
-    return ", ".join(filter(None, (words, mode)))
+    name = f"({channel})" if words and channel else ""
+    return " ".join(filter(None, (", ".join(filter(None, (words, mode))), name)))
 
 
 _DETECTION: Final = {

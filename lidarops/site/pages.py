@@ -91,7 +91,7 @@ def product(
         "product.html",
         page,
         entry=entry,
-        heading=f"{_about(entry.kind, 'Product of kind')}, {entry.light or entry.channel}",
+        heading=f"{_about(entry.kind, 'Product of kind')}, {entry.label}",
         trail=[*_trail(entry, page), (entry.day, href(day_page(entry.station, entry.day), page))],
         file=file,
         summary=[

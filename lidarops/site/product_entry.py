@@ -83,7 +83,7 @@ class Entry:
     @property
     def label(self) -> str:
         """Channel in words, with its name."""
-        return f"{self.light} ({self.channel})" if self.light else self.channel
+        return self.light or self.channel
 
     @property
     def day(self) -> str:

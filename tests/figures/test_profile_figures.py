@@ -192,7 +192,7 @@ class TestGallery:
             "Profile at 2026-03-01 10",
         ]
         for picture in filled.pictures:
-            assert picture.caption.endswith(": 532 nm, photon counting, Lidar One")
+            assert picture.caption.endswith(": 532 nm, photon counting (photon_532o), Lidar One")
             assert picture.figure.words
 
     def test_a_damaged_product_is_listed_and_the_others_are_drawn(self, archive, made):

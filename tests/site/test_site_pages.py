@@ -200,9 +200,9 @@ def test_days_lead_to_the_others_of_their_month(output: Path) -> None:
 
 def test_human_names_stand_beside_identifiers(output: Path) -> None:
     text = page_of(output, "signal").read_text("utf-8")
-    assert "<h1>Range-corrected signals, 532 nm, photon counting</h1>" in text
+    assert "<h1>Range-corrected signals, 532 nm, photon counting (photon_532o)</h1>" in text
     assert "Одеса, hill; Lidar One; 2026-03-01, 10:00 to 10:50\u00a0UTC" in text
-    assert "532 nm, photon counting (photon_532o)" in text
+    assert "532 nm, photon counting (photon_532o)</" in text
 
 
 def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
