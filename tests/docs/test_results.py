@@ -219,16 +219,16 @@ def test_the_scoreboard_shows_ours_beside_all_others() -> None:
 @each(
     ("case", "accuracy", "speed"),
     [
-        ("homogeneous path,", {"equal error"}, "slower"),
-        ("elastic inversion, background", {"equal error", "less accurate"}, "slower"),
-        ("scans over.* cloud,", {"more accurate"}, "slower"),
-        ("scans over.* clear air,", {"more accurate", "equal error"}, "slower"),
+        ("homogeneous path,", {"equal error"}, {"slower"}),
+        ("elastic inversion, background", {"equal error", "less accurate"}, {"slower"}),
+        ("scans over.* cloud,", {"more accurate"}, {"slower"}),
+        ("scans over.* clear air,", {"more accurate", "equal error"}, {"slower"}),
         (
             "networks of lidars,.*(homogeneous|gradient|beams, plume|triangle, plume),",
             {"equal error"},
-            "slower",
+            {"slower", "faster"},
         ),
-        ("networks of lidars,.* drifting plume,", {"more accurate"}, "slower"),
+        ("networks of lidars,.* drifting plume,", {"more accurate"}, {"slower"}),
     ],
 )
 def test_the_page_says_how_ours_stand_beside_peers(case, accuracy, speed) -> None:
@@ -240,4 +240,4 @@ def test_the_page_says_how_ours_stand_beside_peers(case, accuracy, speed) -> Non
     }
     assert verdicts_of_case
     assert {accurate for accurate, _ in verdicts_of_case} <= accuracy
-    assert {fast for _, fast in verdicts_of_case} == {speed}
+    assert {fast for _, fast in verdicts_of_case} <= speed
