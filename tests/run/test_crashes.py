@@ -24,7 +24,7 @@ from lidarops.run.archive import Options, bring_up_to_date, reprocess
 
 NO_PROCESS = 2**22 + 1
 """Larger than the number of any process."""
-KILLS = int(os.environ.get("LIDAROPS_TEST_KILLS", "12"))
+KILLS = int(os.environ.get("LIDAROPS_TEST_KILLS", "30"))
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
