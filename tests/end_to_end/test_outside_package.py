@@ -194,7 +194,7 @@ def test_reports_and_pages_show_it(copied: Campaign) -> None:
     run("report", page.parent)
     text = page.read_text(encoding="utf-8")
     title = "Integral of the range-corrected signal over the window against time"
-    assert f"{title}: 532 nm, photon counting, " in text
+    assert f"{title}: 532 nm, photon counting (photon_" in text
     run("site", copied.output)
     site = Path(copied.output) / "site"
     (day,) = site.rglob("2025-01-01.html")
