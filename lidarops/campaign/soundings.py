@@ -143,8 +143,10 @@ _PLACE: Final = {"latitude": ("latitude", "lat"), "longitude": ("longitude", "lo
 
 def soundings(
     folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
-) -> tuple[TimedProfile, ...]:
-    """Return the profiles of a file that can be used, in the order of the file.
+) -> tuple[tuple[TimedProfile, ...], str]:
+    """Return the profiles of a file that can be used, in its order, and what of it is damaged.
+
+    The damage is told in words. A sounding that is only too short is none: archives hold many.
 
     Parameters
     ----------
@@ -160,18 +162,7 @@ def soundings(
     Raises
     ------
     AncillaryError
-        If the file holds none; the message names file, field and remedy.
-    """
-    return read_soundings(folder, name, reading, place)[0]
-
-
-def read_soundings(
-    folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
-) -> tuple[tuple[TimedProfile, ...], str]:
-    """Return what `soundings` does, and in words what of the file is damaged and not used.
-
-    A sounding that is only too short is no damage: archives hold many. Arguments and errors are
-    those of `soundings`.
+        If the file holds no profile; the message names file, field and remedy.
     """
     found: list[TimedProfile] = []
     damaged: list[tuple[str, AncillaryError]] = []
@@ -380,8 +371,8 @@ def _gdas(text: str) -> Record:
     return Record(
         {"pres": ("hpa", _numbers([line[:6] for line in rows])), **columns},
         datetime(year + (1900 if year > 50 else 2000), month, day, hour, minute, tzinfo=UTC),
-        # The grid has 1 degree, from the south pole and Greenwich on. The file names the place that
-        # was asked for.
+        # The grid has 1 degree, from the south pole and Greenwich on. The place that the file names
+        # is the one requested of the program, up to half a step away.
         (row - 91.0, (column + 179.0) % 360.0 - 180.0),
         "gdas",
     )

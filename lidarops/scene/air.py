@@ -112,7 +112,7 @@ def _parsed(
     from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
 
     stated = AtmosphereReading.model_validate_json(reading)
-    return tuple(one.profile for one in soundings(folder, name, stated, place))
+    return tuple(one.profile for one in soundings(folder, name, stated, place)[0])
 
 
 def _changed(path: Path) -> tuple[int, int]:
@@ -329,10 +329,10 @@ def _read(
     folder: Path, name: str, reading: AtmosphereReading, place: tuple[float, float]
 ) -> tuple[list[list[Any]], str]:
     """Return the profiles of a file, as of `_Found`, and what of it cannot be used."""
-    from lidarops.campaign.soundings import read_soundings  # noqa: PLC0415 - loads xarray
+    from lidarops.campaign.soundings import soundings  # noqa: PLC0415 - loads xarray
 
     try:
-        read, problem = read_soundings(folder, name, reading, place)
+        read, problem = soundings(folder, name, reading, place)
     except AncillaryError as error:
         return [], str(error).removeprefix(f"{name}: ")
     tops = (round(float(one.profile.altitude[-1])) for one in read)

@@ -17,7 +17,7 @@ from support.archives.sounding_texts import COLUMNS, HEIGHTS, LATITUDE, LONGITUD
 from support.cases import each
 
 from lidarops.campaign.atmosphere import AtmosphereReading
-from lidarops.campaign.soundings import TimedProfile, read_soundings, soundings
+from lidarops.campaign.soundings import TimedProfile, soundings
 from lidarops.errors import AncillaryError
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 
@@ -27,12 +27,12 @@ GIVEN = {"latitude": LATITUDE, "longitude": LONGITUDE}
 
 
 def read(path: Path, **given: object) -> tuple[TimedProfile, ...]:
-    return soundings(path.parent, path.name, AtmosphereReading.model_validate(given), PLACE)
+    return soundings(path.parent, path.name, AtmosphereReading.model_validate(given), PLACE)[0]
 
 
 def damage(path: Path) -> tuple[list[datetime], str]:
     """Return the times of what is used of a file, and what is damaged."""
-    found, words = read_soundings(path.parent, path.name, AtmosphereReading(), PLACE)
+    found, words = soundings(path.parent, path.name, AtmosphereReading(), PLACE)
     return [one.time for one in found], words
 
 

@@ -275,7 +275,7 @@ def test_stated_errors_are_those_of_real_soundings(data_root: Path) -> None:
     z = np.arange(1000.0, 20_001.0, 500.0)
     found = [
         one
-        for one in soundings(folder, name, AtmosphereReading(), (48.2, 16.4))
+        for one in soundings(folder, name, AtmosphereReading(), (48.2, 16.4))[0]
         if one.profile.altitude[0] < z[0] and one.profile.altitude[-1] > z[-1]
     ]
     assert len(found) > 300
